@@ -1,0 +1,1 @@
+"""CIA-SSD in JAX."""

@@ -1,0 +1,346 @@
+"""What a detector is, as frozen dataclasses of numbers and tuples, and the named presets.
+
+A config is hashable (a static argument of jit), says why a value is refused, and round-trips through JSON.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """The voxel grid; x, y, z in metres (SPEC section 3; paper section 4.1)."""
+
+    minimum: tuple[float, float, float] = (0.0, -40.0, -3.0)
+    maximum: tuple[float, float, float] = (70.4, 40.0, 1.0)
+    voxel_size: tuple[float, float, float] = (0.05, 0.05, 0.1)
+    max_points_per_voxel: int = 5
+    max_voxels: int = 20000
+    # What happens to the points that come after the last voxel was given out: "skip" leaves out new voxels
+    # only, "stop" ignores every later point, as the released code does.
+    overflow: Literal["skip", "stop"] = "skip"
+
+    def __post_init__(self) -> None:
+        for axis, low, high, size in zip("xyz", self.minimum, self.maximum, self.voxel_size, strict=True):
+            if not (size > 0 and high > low):
+                raise ValueError(
+                    f"grid.{axis}: range {low}..{high} with voxel size {size} is empty; "
+                    "the maximum must exceed the minimum and the voxel size be positive."
+                )
+            cells = (high - low) / size
+            if abs(cells - round(cells)) > 1e-3:
+                raise ValueError(
+                    f"grid.{axis}: {high - low:g} m is {cells:.3f} voxels of {size} m, which is no whole number; "
+                    f"the nearest valid maximum is {low + round(cells) * size:g}."
+                )
+        if self.max_points_per_voxel < 1 or self.max_voxels < 1:
+            raise ValueError("grid: max_points_per_voxel and max_voxels must be at least 1.")
+        depth, height, width = self.shape
+        if depth * height * width >= 2**31:
+            raise ValueError(
+                f"grid: {depth} x {height} x {width} voxels do not fit the 32-bit keys of the sparse "
+                "convolutions; use larger voxels or a smaller range."
+            )
+
+    @property
+    def cells(self) -> tuple[int, int, int]:
+        """Number of voxels along x, y, z."""
+        x, y, z = (
+            round((high - low) / size)
+            for low, high, size in zip(self.minimum, self.maximum, self.voxel_size, strict=True)
+        )
+        return x, y, z
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (z, y, x) of the sparse grid: one empty layer on top, as in SECOND."""
+        x, y, z = self.cells
+        return z + 1, y, x
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One resolution of the backbone: a strided convolution into it (none for the first), then submanifold ones."""
+
+    channels: int
+    layers: int
+    capacity: int
+    z_padding: int = 1
+
+    def __post_init__(self) -> None:
+        if self.channels < 1 or self.layers < 0 or self.capacity < 1 or self.z_padding not in (0, 1):
+            raise ValueError(
+                f"backbone stage {self}: channels and capacity must be at least 1, layers at least 0, "
+                "z_padding 0 or 1."
+            )
+
+
+@dataclass(frozen=True)
+class BackboneConfig:
+    """SPConvNet (paper section 3.1, SPEC section 4). The first stage's capacity is the grid's `max_voxels`."""
+
+    stages: tuple[StageConfig, ...] = (
+        StageConfig(channels=16, layers=2, capacity=20000),
+        StageConfig(channels=32, layers=2, capacity=48000),
+        StageConfig(channels=64, layers=3, capacity=36000),
+        StageConfig(channels=64, layers=3, capacity=18000, z_padding=0),
+    )
+    out_channels: int = 64
+    out_capacity: int = 16000
+    # "gather" computes active sites only; "dense" the whole grid: the definition, for small grids and tests.
+    backend: Literal["gather", "dense"] = "gather"
+
+    def __post_init__(self) -> None:
+        if not self.stages:
+            raise ValueError("backbone: at least one stage is needed.")
+        if self.backend not in ("gather", "dense"):
+            raise ValueError(f"backbone: backend {self.backend!r} is unknown; choose 'gather' or 'dense'.")
+
+    def stage_shapes(self, shape: tuple[int, int, int]) -> tuple[tuple[int, int, int], ...]:
+        """Grid shape (z, y, x) of every stage and of the output, from the shape of the input."""
+        shapes = [shape]
+        for stage in self.stages[1:]:
+            depth, height, width = shapes[-1]
+            shapes.append(((depth + 2 * stage.z_padding - 3) // 2 + 1, (height - 1) // 2 + 1, (width - 1) // 2 + 1))
+        depth, height, width = shapes[-1]
+        shapes.append(((depth - 3) // 2 + 1, height, width))
+        return tuple(shapes)
+
+    @property
+    def stride(self) -> int:
+        """Voxels per BEV cell along x and y."""
+        return 2 ** (len(self.stages) - 1)
+
+
+@dataclass(frozen=True)
+class NeckConfig:
+    """SSFA (paper section 3.2, SPEC section 5). The semantic branch has twice the spatial channels."""
+
+    channels: int = 128
+    attention_kernel: Literal[1, 3] = 3
+
+    def __post_init__(self) -> None:
+        if self.channels < 1 or self.attention_kernel not in (1, 3):
+            raise ValueError(f"neck {self}: channels must be at least 1 and attention_kernel 1 or 3.")
+
+
+@dataclass(frozen=True)
+class ClassConfig:
+    """One class and its anchor: size in metres, height of the anchor's centre, matching thresholds."""
+
+    name: str = "Car"
+    width: float = 1.6
+    length: float = 3.9
+    height: float = 1.56
+    center_z: float = -1.0
+    matched: float = 0.6
+    unmatched: float = 0.45
+    # A detection needs this much IoU-weighted support (mu of Algorithm 1).
+    support_threshold: float = 2.6
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.length, self.height) <= 0:
+            raise ValueError(f"class {self.name}: width, length and height must be positive.")
+        if not 0 < self.unmatched <= self.matched <= 1:
+            raise ValueError(f"class {self.name}: thresholds must satisfy 0 < unmatched <= matched <= 1.")
+
+
+@dataclass(frozen=True)
+class HeadConfig:
+    """Multi-task head (paper section 3.3, SPEC section 6); `angles` are the anchors' r in radians."""
+
+    angles: tuple[float, ...] = (0.0, math.pi / 2)
+    iou_kernel: Literal[1, 3] = 1
+    iou_bias: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.angles or self.iou_kernel not in (1, 3):
+            raise ValueError(f"head {self}: at least one angle is needed, and iou_kernel must be 1 or 3.")
+
+
+@dataclass(frozen=True)
+class DetectionConfig:
+    """From raw predictions to boxes (paper section 3.4 and Algorithm 1, SPEC section 10)."""
+
+    score_threshold: float = 0.3
+    max_candidates: int = 1000
+    iou_exponent: float = 4.0
+    clamp_iou: bool = True
+    nms: Literal["paper", "released", "rotated"] = "paper"
+    nms_overlap: float = 0.3
+    # sigma squared of the Gaussian weight for boxes nearer than each distance; the last serves all beyond.
+    sigma_squared: tuple[float, float, float, float] = (0.0009, 0.009, 0.1, 1.0)
+    sigma_distances: tuple[float, float, float] = (20.0, 40.0, 60.0)
+    z_limits: tuple[float, float] = (-5.0, 5.0)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.score_threshold < 1:
+            raise ValueError(f"detection.score_threshold: {self.score_threshold} is outside [0, 1).")
+        if self.max_candidates < 1:
+            raise ValueError("detection.max_candidates must be at least 1.")
+        if self.nms not in ("paper", "released", "rotated"):
+            raise ValueError(f"detection.nms: {self.nms!r} is unknown; choose 'paper', 'released' or 'rotated'.")
+        if min(self.sigma_squared) <= 0 or list(self.sigma_distances) != sorted(self.sigma_distances):
+            raise ValueError("detection: sigma_squared must be positive and sigma_distances ascending.")
+
+
+@dataclass(frozen=True)
+class Config:
+    """A whole detector. The defaults are the paper's (`car()`)."""
+
+    grid: GridConfig = field(default_factory=GridConfig)
+    backbone: BackboneConfig = field(default_factory=BackboneConfig)
+    neck: NeckConfig = field(default_factory=NeckConfig)
+    classes: tuple[ClassConfig, ...] = (ClassConfig(),)
+    head: HeadConfig = field(default_factory=HeadConfig)
+    detection: DetectionConfig = field(default_factory=DetectionConfig)
+    # Compute type of the network; parameters, BatchNorm, coordinates, IoU and NMS stay float32.
+    dtype: Literal["float32", "bfloat16"] = "float32"
+
+    def __post_init__(self) -> None:
+        if not self.classes or len({c.name for c in self.classes}) != len(self.classes):
+            raise ValueError("classes: at least one is needed, each with its own name.")
+        if self.dtype not in ("float32", "bfloat16"):
+            raise ValueError(f"dtype: {self.dtype!r} is unknown; choose 'float32' or 'bfloat16'.")
+        if self.backbone.stages[0].capacity != self.grid.max_voxels:
+            raise ValueError(
+                f"backbone: the first stage holds {self.backbone.stages[0].capacity} sites but the grid "
+                f"{self.grid.max_voxels} voxels; the two must be equal."
+            )
+        multiple = 2 * self.backbone.stride
+        for axis, cells in zip("xy", self.grid.cells, strict=False):
+            if cells % multiple:
+                raise ValueError(
+                    f"grid.{axis}: {cells} voxels are not divisible by {multiple} ({self.backbone.stride} voxels "
+                    f"per BEV cell, halved once more in the neck); the nearest valid counts are "
+                    f"{cells // multiple * multiple} and {(cells // multiple + 1) * multiple}."
+                )
+        depths = [shape[0] for shape in self.backbone.stage_shapes(self.grid.shape)]
+        if depths[-1] < 1:
+            raise ValueError(
+                f"grid.z: {self.grid.cells[2]} voxels shrink to {' -> '.join(map(str, depths))} layers; "
+                "use smaller voxels, a taller range or fewer stages."
+            )
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names in label order: label 0 is the first."""
+        return tuple(c.name for c in self.classes)
+
+    @property
+    def bev_shape(self) -> tuple[int, int]:
+        """Cells (y, x) of the BEV map."""
+        return self.backbone.stage_shapes(self.grid.shape)[-1][1:]
+
+    @property
+    def bev_channels(self) -> int:
+        """Channels of the BEV map: the z layers folded into the features."""
+        return self.backbone.out_channels * self.backbone.stage_shapes(self.grid.shape)[-1][0]
+
+    @property
+    def anchors_per_cell(self) -> int:
+        """One anchor for every class and angle."""
+        return len(self.classes) * len(self.head.angles)
+
+    def to_json(self) -> str:
+        """The whole config as JSON text."""
+        return json.dumps(dataclasses.asdict(self), indent=1)
+
+    @classmethod
+    def from_json(cls, text: str) -> Config:
+        """Read `to_json`'s text; unknown or missing fields and wrong types are a ValueError that names them."""
+        try:
+            data = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"The config is no valid JSON ({error}).") from error
+        return _build(cls, data, "config")
+
+
+def _build(kind: Any, data: Any, where: str) -> Any:
+    """Rebuild a value of the annotated type from parsed JSON."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        names = {f.name for f in dataclasses.fields(kind)}
+        if not isinstance(data, dict) or set(data) != names:
+            given = set(data) if isinstance(data, dict) else set()
+            raise ValueError(
+                f"{where}: expected the fields {sorted(names)}; unknown {sorted(given - names)}, "
+                f"missing {sorted(names - given)}."
+            )
+        hints = typing.get_type_hints(kind)
+        return kind(**{name: _build(hints[name], data[name], f"{where}.{name}") for name in data})
+    if origin is tuple:
+        if not isinstance(data, list):
+            raise ValueError(f"{where}: expected a list, not {data!r}.")
+        kinds = [arguments[0]] * len(data) if arguments[-1] is Ellipsis else list(arguments)
+        if len(kinds) != len(data):
+            raise ValueError(f"{where}: expected {len(kinds)} values, not {len(data)}.")
+        return tuple(_build(k, item, f"{where}[{i}]") for i, (k, item) in enumerate(zip(kinds, data, strict=True)))
+    if origin is Literal:
+        if data not in arguments:
+            raise ValueError(f"{where}: {data!r} is not one of {list(arguments)}.")
+        return data
+    if kind is float and isinstance(data, int) and not isinstance(data, bool):
+        return float(data)
+    if origin is types.UnionType and any(isinstance(data, a) for a in arguments):
+        return data
+    if type(data) is not kind:
+        raise ValueError(f"{where}: expected {kind.__name__}, not {data!r}.")
+    return data
+
+
+def car() -> Config:
+    """The paper's car detector on KITTI, with every open point decided as in the README's table."""
+    return Config()
+
+
+def car_released() -> Config:
+    """The authors' released code, quirks included: with their weights it gives their boxes."""
+    config = car()
+    return replace(
+        config,
+        grid=replace(config.grid, overflow="stop"),
+        neck=replace(config.neck, attention_kernel=1),
+        head=HeadConfig(angles=(0.0, 1.57), iou_kernel=3, iou_bias=False),
+        detection=replace(config.detection, nms="released", clamp_iou=False),
+    )
+
+
+def three_class() -> Config:
+    """Car, pedestrian and cyclist; not in the paper and not tuned."""
+    small = {"width": 0.6, "center_z": -0.6, "height": 1.73, "matched": 0.5, "unmatched": 0.35}
+    return replace(
+        car(),
+        classes=(
+            ClassConfig(),
+            ClassConfig(name="Pedestrian", length=0.8, support_threshold=1.0, **small),  # type: ignore[arg-type]
+            ClassConfig(name="Cyclist", length=1.76, support_threshold=1.0, **small),  # type: ignore[arg-type]
+        ),
+    )
+
+
+def tiny() -> Config:
+    """A toy of the same shape for tests and notebooks: 12.8 m x 12.8 m, a few thousand parameters."""
+    return Config(
+        grid=GridConfig(
+            minimum=(0.0, -6.4, -3.0), maximum=(12.8, 6.4, 1.0), voxel_size=(0.1, 0.1, 0.2), max_voxels=2048
+        ),
+        backbone=BackboneConfig(
+            stages=(
+                StageConfig(channels=4, layers=1, capacity=2048),
+                StageConfig(channels=8, layers=1, capacity=2048),
+                StageConfig(channels=8, layers=1, capacity=1024),
+            ),
+            out_channels=8,
+            out_capacity=1024,
+        ),
+        neck=NeckConfig(channels=16),
+        detection=DetectionConfig(max_candidates=128),
+    )

@@ -1,0 +1,27 @@
+"""What a file that cannot be used raises."""
+
+from __future__ import annotations
+
+import os
+
+Pathlike = str | os.PathLike[str]
+
+
+class FormatError(ValueError):
+    """A file cannot be used; the message is one sentence that names it and the remedy."""
+
+
+def read_bytes(path: Pathlike, limit: int = -1) -> bytes:
+    """Read a file, or its first `limit` bytes.
+
+    Raises FormatError if there is no such file, or it is a directory or unreadable.
+    """
+    try:
+        with open(path, "rb") as stream:
+            return stream.read(limit)
+    except FileNotFoundError:
+        raise FormatError(f"{path} does not exist; check the path.") from None
+    except IsADirectoryError:
+        raise FormatError(f"{path} is a directory; name a file inside it.") from None
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read ({error.strerror}); check its permissions.") from error

@@ -1,0 +1,209 @@
+"""Point clouds in `.bin` (KITTI), `.npy`, `.npz` and `.pcd` files.
+
+Readers return what the file says; cleaning (NaN, intensity of 0..255) is left to the caller.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from ciassd_jax.formats.errors import FormatError, Pathlike, read_bytes
+
+POINT_SUFFIXES = (".bin", ".npy", ".npz", ".pcd")
+
+_INTENSITY_FIELDS = ("intensity", "reflectance", "i")
+_PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
+
+
+# Garbage bytes read as floats are data to clean, not arithmetic to warn of.
+@np.errstate(over="ignore", invalid="ignore")
+def read_points(path: Pathlike, width: int = 4) -> Float32[np.ndarray, "N 4"]:
+    """Read a point cloud as (x, y, z, intensity), coordinates in metres.
+
+    - `.bin`: little-endian float32, `width` (at least 3) numbers per point.
+    - `.npy`, `.npz`: an array (N, 3 or more); in an archive the array `points`, or the only one.
+    - `.pcd`: ascii or binary, fields x, y, z and one of intensity, reflectance, i.
+
+    Columns after the fourth are ignored. Where there is no intensity it is 0, and a warning says so.
+    Raises FormatError, one sentence with the remedy, for a file that is missing, empty or malformed.
+    """
+    if width < 3:
+        raise ValueError(f"width is {width}; a point has at least the 3 numbers x, y, z.")
+    suffix = Path(path).suffix.lower()
+    data = read_bytes(path)
+    if suffix not in POINT_SUFFIXES:
+        raise FormatError(
+            f"{path} has the unknown suffix '{suffix}'; convert it to one of {', '.join(POINT_SUFFIXES)}."
+        )
+    if not data:
+        raise FormatError(f"{path} is empty; copy or record it again.")
+    if suffix == ".bin":
+        array = _read_bin(data, path, width)
+    elif suffix == ".pcd":
+        array = _read_pcd(data, path)
+    else:
+        array = _read_numpy(data, path, archive=suffix == ".npz")
+    return _as_points(array, path)
+
+
+def write_bin(path: Pathlike, points: Float[np.ndarray, "N 4"]) -> None:
+    """Write (x, y, z, intensity) as little-endian float32, KITTI's `.bin`."""
+    Path(path).write_bytes(points.astype("<f4").tobytes())
+
+
+def _as_points(array: np.ndarray, path: Pathlike) -> Float32[np.ndarray, "N 4"]:
+    """Take the first four columns, or three and intensity 0."""
+    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+        raise FormatError(
+            f"{path} holds an array of shape {array.shape} and type {array.dtype}; "
+            "save numbers of shape (N, 4): x, y, z, intensity."
+        )
+    points = np.zeros((len(array), 4), np.float32)
+    columns = min(array.shape[1], 4)
+    if columns == 3:
+        warnings.warn(f"{path} has no intensity; 0 is used instead.", stacklevel=3)
+    points[:, :columns] = array[:, :columns]
+    return points
+
+
+def _read_bin(data: bytes, path: Pathlike, width: int) -> Float32[np.ndarray, "N width"]:
+    if len(data) % (4 * width):
+        raise FormatError(
+            f"{path} has {len(data)} bytes, not a multiple of {4 * width} ({width} float32 per point); "
+            "copy it again, or pass the true number as `width`."
+        )
+    return np.frombuffer(data, "<f4").reshape(-1, width)
+
+
+def _read_numpy(data: bytes, path: Pathlike, *, archive: bool) -> np.ndarray:
+    """Read an array, or the one array of an archive that can be meant, without unpickling anything."""
+    try:
+        if not archive:
+            return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            names = arrays.files
+            if "points" in names or len(names) == 1:
+                return np.asarray(arrays["points" if "points" in names else names[0]])
+    except Exception as error:  # NumPy and zipfile meet garbage with half a dozen types of error
+        raise FormatError(
+            f"{path} is cut short or no {'.npz' if archive else '.npy'} file of plain numbers; "
+            f"write it again with np.{'savez' if archive else 'save'}."
+        ) from error
+    raise FormatError(
+        f"{path} holds {len(names)} arrays ({', '.join(names)}) and none is named 'points'; "
+        "write it again with np.savez(path, points=points)."
+    )
+
+
+class _PcdField(NamedTuple):
+    """Where a field lies in a row: its first byte, its first column, and its type."""
+
+    offset: int
+    column: int
+    dtype: np.dtype
+
+
+class _PcdHeader(NamedTuple):
+    """Fields by name, bytes and columns per row, number of rows, and how the rows are stored."""
+
+    fields: dict[str, _PcdField]
+    stride: int
+    columns: int
+    num_points: int
+    storage: str
+
+
+def _read_pcd(data: bytes, path: Pathlike) -> Float[np.ndarray, "N columns"]:
+    header, body = _read_pcd_header(data, path)
+    missing = [name for name in "xyz" if name not in header.fields]
+    if missing:
+        raise FormatError(
+            f"{path} has the fields {', '.join(header.fields)} but not {', '.join(missing)}; "
+            "save it again with x, y, z and intensity."
+        )
+    intensity = [name for name in _INTENSITY_FIELDS if name in header.fields][:1]
+    fields = [header.fields[name] for name in ("x", "y", "z", *intensity)]
+    if header.storage == "ascii":
+        return _read_pcd_ascii(body, path, header, fields)
+    if header.storage == "binary":
+        return _read_pcd_binary(body, path, header, fields)
+    raise FormatError(
+        f"{path} stores its points as '{header.storage}', which is not read; "
+        f"convert it with `pcl_convert_pcd_ascii_binary {path} out.pcd 1`."
+    )
+
+
+def _read_pcd_ascii(
+    body: bytes, path: Pathlike, header: _PcdHeader, fields: list[_PcdField]
+) -> Float[np.ndarray, "N columns"]:
+    try:
+        values = np.array(body.split(), np.float64)
+    except ValueError as error:
+        raise FormatError(f"{path} has a point that is no number ({error}); save it again.") from error
+    if values.size != header.num_points * header.columns:
+        raise FormatError(
+            f"{path} announces {header.num_points} points of {header.columns} numbers "
+            f"but holds {values.size} numbers; copy or save it again."
+        )
+    return values.reshape(-1, header.columns)[:, [field.column for field in fields]]
+
+
+def _read_pcd_binary(
+    body: bytes, path: Pathlike, header: _PcdHeader, fields: list[_PcdField]
+) -> Float[np.ndarray, "N columns"]:
+    # A few bytes after the last point are harmless: some writers end the file with a newline.
+    if len(body) // header.stride != header.num_points:
+        raise FormatError(
+            f"{path} announces {header.num_points} points of {header.stride} bytes "
+            f"but holds {len(body)} bytes; copy or save it again."
+        )
+    names = [str(field.column) for field in fields]
+    formats, offsets = [field.dtype for field in fields], [field.offset for field in fields]
+    row = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": header.stride})
+    rows = np.frombuffer(body, row, count=header.num_points)
+    return np.stack([rows[name].astype(np.float64) for name in names], -1)
+
+
+def _read_pcd_header(data: bytes, path: Pathlike) -> tuple[_PcdHeader, bytes]:
+    """Split a PCD file into its header and the bytes after it."""
+    entries: dict[str, list[str]] = {}
+    stream = io.BytesIO(data)
+    for line in stream:
+        key, *values = line.decode("latin-1").split() or ["#"]
+        entries[key] = values
+        if key == "DATA":
+            break
+    try:
+        return _parse_pcd_header(entries), stream.read()
+    except (LookupError, TypeError, ValueError) as error:
+        raise FormatError(
+            f"{path} has a malformed PCD header ({error}); "
+            "save it again with FIELDS, SIZE, TYPE, WIDTH, HEIGHT, POINTS and DATA."
+        ) from error
+
+
+def _parse_pcd_header(entries: dict[str, list[str]]) -> _PcdHeader:
+    """Lay out a row; raises LookupError, TypeError or ValueError for a missing or senseless entry."""
+    names = entries["FIELDS"]
+    counts = [int(count) for count in entries.get("COUNT", ["1"] * len(names))]
+    fields: dict[str, _PcdField] = {}
+    stride = columns = 0
+    for name, size, kind, count in zip(names, entries["SIZE"], entries["TYPE"], counts, strict=True):
+        if int(size) < 1 or count < 1:
+            raise ValueError(f"field {name} has size {size} and count {count}")
+        fields.setdefault(name, _PcdField(stride, columns, np.dtype(f"<{_PCD_KINDS[kind]}{size}")))
+        stride += int(size) * count
+        columns += count
+    sizes = ["POINTS"] if "POINTS" in entries else ["WIDTH", "HEIGHT"]
+    rows = math.prod(int(entries[key][0]) for key in sizes)
+    if rows < 0 or not 0 < stride < 2**31:
+        raise ValueError(f"{rows} points of {stride} bytes")
+    (storage,) = entries["DATA"]
+    return _PcdHeader(fields, stride, columns, rows, storage)

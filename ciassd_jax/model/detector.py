@@ -1,0 +1,32 @@
+"""The whole network: the architecture figure in code (paper Figure 2)."""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from ciassd_jax.config import Config
+from ciassd_jax.model.backbone import SPConvNet
+from ciassd_jax.model.head import MultiTaskHead
+from ciassd_jax.model.neck import SSFA
+from ciassd_jax.types import Predictions, SparseVoxels
+
+
+class CIASSD(nn.Module):
+    """Voxels of a batch of scenes to raw predictions for every anchor."""
+
+    config: Config
+    axis_name: str | None = None
+
+    @nn.compact
+    def __call__(
+        self, voxels: SparseVoxels, *, train: bool = False
+    ) -> tuple[Predictions, Int[Array, "B S"], Int[Array, "B S"]]:
+        """Predictions, and the active sites kept and dropped at each strided stage of the backbone."""
+        config, dtype = self.config, jnp.dtype(self.config.dtype)
+        backbone = SPConvNet(config.backbone, config.grid.shape, dtype, self.axis_name, name="backbone")
+        bev, kept, dropped = backbone(voxels, train=train)
+        features = SSFA(config.neck, dtype, self.axis_name, name="neck")(bev, train=train)
+        head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, name="head")
+        return head(features), kept, dropped

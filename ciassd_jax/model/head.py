@@ -1,0 +1,61 @@
+"""The multi-task head: class, box, direction and the box's own IoU (paper section 3.3, SPEC section 6)."""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ciassd_jax.config import HeadConfig
+from ciassd_jax.model.layers import uniform_by_fan_in
+from ciassd_jax.types import Predictions
+
+
+class Branch(nn.Module):
+    """One convolution; its result is float32 whatever the compute type."""
+
+    channels: int
+    kernel_size: int
+    use_bias: bool
+    dtype: jnp.dtype
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B H W C"]) -> Float[Array, "B H W O"]:
+        size, inputs = self.kernel_size, x.shape[-1]
+        init = uniform_by_fan_in(size * size * inputs)
+        kernel = self.param("kernel", init, (size, size, inputs, self.channels), jnp.float32)
+        padding = size // 2
+        x = lax.conv_general_dilated(
+            x.astype(self.dtype),
+            kernel.astype(self.dtype),
+            (1, 1),
+            [(padding, padding)] * 2,
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+            precision=lax.Precision.HIGHEST,
+        ).astype(jnp.promote_types(self.dtype, jnp.float32))
+        if self.use_bias:
+            x = x + self.param("bias", init, (self.channels,), jnp.float32).reshape(1, 1, 1, -1)
+        return x
+
+
+class MultiTaskHead(nn.Module):
+    """Four branches on the same features, flattened to one row per anchor (y, x, then anchor of the cell)."""
+
+    config: HeadConfig
+    anchors_per_cell: int
+    dtype: jnp.dtype
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B H W C"]) -> Predictions:
+        anchors, batch = self.anchors_per_cell, x.shape[0]
+        box = Branch(7 * anchors, 1, True, self.dtype, name="box")(x)
+        class_logit = Branch(anchors, 1, True, self.dtype, name="class")(x)
+        direction = Branch(2 * anchors, 1, True, self.dtype, name="direction")(x)
+        iou = Branch(anchors, self.config.iou_kernel, self.config.iou_bias, self.dtype, name="iou")(x)
+        return Predictions(
+            box=box.reshape(batch, -1, 7),
+            class_logit=class_logit.reshape(batch, -1),
+            direction=direction.reshape(batch, -1, 2),
+            iou=iou.reshape(batch, -1),
+        )

@@ -1,0 +1,175 @@
+"""Layers of the network: BatchNorm over real entries only, convolutions with it and ReLU, sparse ones too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+Initializer = Callable[..., Array]
+Convolution = Callable[[Array, Array], Array]
+
+EPSILON = 1e-3
+MOMENTUM = 0.99
+
+
+def uniform_by_fan_in(fan_in: int) -> Initializer:
+    """U(-1 / sqrt(fan_in), 1 / sqrt(fan_in)), as the released code initialises (SPEC sections 4 to 6)."""
+    bound = 1 / math.sqrt(fan_in)
+
+    def init(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return init
+
+
+class MaskedBatchNorm(nn.Module):
+    """BatchNorm over the real entries of the whole batch, on all devices when `axis_name` is given.
+
+    Sums and counts are pooled before they are divided, so that unequal devices weigh as their entries do and an
+    empty one, or an empty batch, stays finite (it leaves the running statistics as they were). Float32 always.
+    """
+
+    axis_name: str | None = None
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "*n C"], mask: Bool[Array, "*n"] | None = None, *, train: bool = False
+    ) -> Float[Array, "*n C"]:
+        channels = x.shape[-1]
+        scale = self.param("scale", nn.initializers.ones, (channels,), jnp.float32)
+        bias = self.param("bias", nn.initializers.zeros, (channels,), jnp.float32)
+        mean = self.variable("batch_stats", "mean", jnp.zeros, (channels,), jnp.float32)
+        variance = self.variable("batch_stats", "var", jnp.ones, (channels,), jnp.float32)
+        if train:
+            used_mean, used_variance, empty = self._batch_statistics(x, mask)
+            if not self.is_initializing():
+                for running, new in ((mean, used_mean), (variance, used_variance)):
+                    updated = MOMENTUM * running.value + (1 - MOMENTUM) * new
+                    running.value = jnp.where(empty, running.value, updated)
+        else:
+            used_mean, used_variance = mean.value, variance.value
+        factor = scale * lax.rsqrt(used_variance + EPSILON)
+        shape = (1,) * (x.ndim - 1) + (channels,)
+        result = x * factor.reshape(shape) + (bias - used_mean * factor).reshape(shape)
+        return result.astype(x.dtype)
+
+    def _batch_statistics(self, x: Array, mask: Array | None) -> tuple[Array, Array, Array]:
+        """Mean and biased variance of the real entries, and whether there are none."""
+        axes = tuple(range(x.ndim - 1))
+        values = x.astype(jnp.promote_types(x.dtype, jnp.float32))
+        real = jnp.ones(x.shape[:-1], bool) if mask is None else mask
+        count = real.sum(dtype=values.dtype)
+        total = jnp.where(real[..., None], values, 0).sum(axes)
+        if self.axis_name is not None:
+            total, count = lax.psum((total, count), self.axis_name)
+        entries = jnp.maximum(count, 1)
+        mean = total / entries
+        # Around the mean, not from the mean square: no cancellation.
+        spread = jnp.where(real[..., None], values - mean.reshape((1,) * len(axes) + (-1,)), 0)
+        squares = (spread**2).sum(axes)
+        if self.axis_name is not None:
+            squares = lax.psum(squares, self.axis_name)
+        return mean, squares / entries, count == 0
+
+
+class SparseConvNormRelu(nn.Module):
+    """A sparse convolution without bias, BatchNorm over the active sites, ReLU; padding rows stay zero.
+
+    `convolution` maps (features, kernel [K, C, O]) to features at the output sites, of which `mask` are real.
+    """
+
+    channels: int
+    kernel_size: tuple[int, int, int]
+    dtype: jnp.dtype
+    axis_name: str | None = None
+
+    @nn.compact
+    def __call__(
+        self, features: Float[Array, "U C"], convolution: Convolution, mask: Bool[Array, " V"], *, train: bool
+    ) -> Float[Array, "V O"]:
+        depth, height, width = self.kernel_size
+        inputs = features.shape[-1]
+        # spconv 1.x misreads its fan-in as kH * kW * C * O; BatchNorm follows, so only step sizes feel it.
+        init = uniform_by_fan_in(height * width * inputs * self.channels)
+        kernel = self.param("kernel", init, (depth, height, width, inputs, self.channels), jnp.float32)
+        kernel = kernel.reshape(-1, inputs, self.channels).astype(self.dtype)
+        x = convolution(features.astype(self.dtype), kernel)
+        x = MaskedBatchNorm(self.axis_name, name="norm")(x, mask, train=train)
+        return jnp.where(mask[:, None], nn.relu(x), 0)
+
+
+class ConvNormRelu(nn.Module):
+    """A 2D convolution without bias on [B, H, W, C], BatchNorm, and ReLU where asked."""
+
+    channels: int
+    kernel_size: int
+    dtype: jnp.dtype
+    stride: int = 1
+    relu: bool = True
+    axis_name: str | None = None
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B H W C"], *, train: bool) -> Float[Array, "B H2 W2 O"]:
+        size, inputs = self.kernel_size, x.shape[-1]
+        shape = (size, size, inputs, self.channels)
+        kernel = self.param("kernel", uniform_by_fan_in(size * size * inputs), shape, jnp.float32)
+        padding = size // 2
+        x = lax.conv_general_dilated(
+            x.astype(self.dtype),
+            kernel.astype(self.dtype),
+            (self.stride, self.stride),
+            [(padding, padding)] * 2,
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+            precision=lax.Precision.HIGHEST,
+        )
+        x = MaskedBatchNorm(self.axis_name, name="norm")(x, train=train)
+        return nn.relu(x) if self.relu else x
+
+
+class UpsampleNormRelu(nn.Module):
+    """Transposed 3 x 3 convolution of stride 2 that doubles H and W, BatchNorm, ReLU (SPEC section 5).
+
+    out[2i - 1 + k] += in[i] * kernel[k] per axis. An even output row reads the middle tap alone, an odd one the
+    outer two: four small convolutions, one for each phase, instead of one over a dilated input.
+    """
+
+    channels: int
+    dtype: jnp.dtype
+    axis_name: str | None = None
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B H W C"], *, train: bool) -> Float[Array, "B H2 W2 O"]:
+        inputs = x.shape[-1]
+        shape = (3, 3, inputs, self.channels)
+        # torch reads the fan-in of a transposed convolution from its outputs.
+        kernel = self.param("kernel", uniform_by_fan_in(9 * self.channels), shape, jnp.float32)
+        x = MaskedBatchNorm(self.axis_name, name="norm")(
+            upsample(x.astype(self.dtype), kernel.astype(self.dtype)), train=train
+        )
+        return nn.relu(x)
+
+
+def upsample(x: Float[Array, "B H W C"], kernel: Float[Array, "3 3 C O"]) -> Float[Array, "B H2 W2 O"]:
+    """Transposed convolution of stride 2, padding 1, output padding 1, as four phase convolutions."""
+    taps = {0: (1,), 1: (2, 0)}
+
+    def phase(odd_y: int, odd_x: int) -> Array:
+        part = kernel[jnp.array(taps[odd_y])][:, jnp.array(taps[odd_x])]
+        return lax.conv_general_dilated(
+            x,
+            part,
+            (1, 1),
+            [(0, odd_y), (0, odd_x)],
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+            precision=lax.Precision.HIGHEST,
+        )
+
+    rows = [jnp.stack([phase(y, 0), phase(y, 1)], 3) for y in (0, 1)]
+    batch, height, width, _ = x.shape
+    return jnp.stack(rows, 2).reshape(batch, 2 * height, 2 * width, -1)

@@ -1,0 +1,188 @@
+"""Rotated NMS and distance-variant IoU-weighted NMS (DI-NMS; paper section 3.4 and Algorithm 1), in parallel.
+
+Greedy suppression is the fixed point of `keep = eligible & ~any(overlaps & earlier & keep)`, reached in a few
+iterations; no loop runs over boxes. All functions take one scene of K candidates in order of selection.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ciassd_jax.ops.iou import iou_bev
+from ciassd_jax.types import Boxes, Candidates
+
+_TILE = 128
+
+
+class Clusters(NamedTuple):
+    """One box for each candidate that was selected (`selected`); the other rows mean nothing."""
+
+    boxes: Boxes
+    score: Float[Array, " K"]
+    selected: Bool[Array, " K"]
+
+
+def pairwise_iou(boxes: Boxes, count: Int[Array, ""]) -> Float[Array, "K K"]:
+    """Rotated BEV IoU of the first `count` boxes with each other, zero elsewhere.
+
+    Computed in tiles, so that padding costs nothing.
+    """
+    capacity = boxes.yaw.shape[0]
+    tile = min(_TILE, capacity)
+    tiles = -(-capacity // tile)
+    padded = jax.tree.map(lambda leaf: _pad_rows(leaf, tiles * tile), boxes)
+    used = -(-count // tile)
+
+    def fill(index: Array, result: Array) -> Array:
+        row, column = index // used * tile, index % used * tile
+        one = jax.tree.map(lambda leaf: lax.dynamic_slice_in_dim(leaf, row, tile)[:, None], padded)
+        other = jax.tree.map(lambda leaf: lax.dynamic_slice_in_dim(leaf, column, tile)[None], padded)
+        return lax.dynamic_update_slice(result, iou_bev(one, other), (row, column))
+
+    empty = jnp.zeros((tiles * tile, tiles * tile), boxes.yaw.dtype)
+    overlap = lax.fori_loop(jnp.int32(0), (used * used).astype(jnp.int32), fill, empty)[:capacity, :capacity]
+    real = jnp.arange(capacity, dtype=jnp.int32) < count
+    return jnp.where(real[:, None] & real[None], overlap, 0)
+
+
+def _pad_rows(array: Array, rows: int) -> Array:
+    return jnp.pad(array, ((0, rows - array.shape[0]),) + ((0, 0),) * (array.ndim - 1))
+
+
+def greedy_keep(overlaps: Bool[Array, "K K"], eligible: Bool[Array, " K"]) -> Bool[Array, " K"]:
+    """Greedy suppression in index order: keep an eligible entry unless an earlier kept one overlaps it."""
+    slots = jnp.arange(eligible.shape[0], dtype=jnp.int32)
+    suppresses = overlaps & (slots[:, None] < slots[None])
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        keep, _ = state
+        updated = eligible & ~(suppresses & keep[:, None]).any(0)
+        return updated, (updated != keep).any()
+
+    return lax.while_loop(lambda state: state[1], step, (eligible, jnp.array(True)))[0]
+
+
+def rotated_nms(
+    candidates: Candidates, *, overlap: float, limit: int | None = None
+) -> Clusters:
+    """Plain NMS within each class: a kept box suppresses later ones of IoU at or above `overlap`.
+
+    `limit` keeps the first so many only. Boxes and scores stay as they are.
+    """
+    iou, _ = _class_overlap(candidates)
+    selected = greedy_keep(iou >= overlap, candidates.valid)
+    if limit is not None:
+        selected &= jnp.cumsum(selected, dtype=jnp.int32) <= limit
+    return Clusters(candidates.boxes, candidates.score, selected)
+
+
+def released_di_nms(
+    candidates: Candidates,
+    *,
+    overlap: float,
+    support_threshold: Float[Array, " K"],
+    sigma_squared: tuple[float, ...],
+    distances: tuple[float, ...],
+) -> Clusters:
+    """DI-NMS as the released code has it (SPEC section 10.2).
+
+    Support counts all candidates of any overlap, so that it is known before any is selected; one without enough
+    support never suppresses. Each kept box averages all candidates of overlap above the limit, raw yaw included.
+    The softmax of squared anchor distances refines the reported score only. Selected boxes beyond the last
+    distance have no weight at all: they are not selected.
+    """
+    iou, real = _class_overlap(candidates)
+    support = jnp.where(iou > 0, iou * candidates.iou[None], 0).sum(1)
+    keep = greedy_keep(iou >= overlap, candidates.valid & (support > support_threshold))
+    members = (iou > overlap) & real
+    refined = candidates.score * (1 - _masked_softmax(candidates.anchor_distance**2, candidates.valid))
+    score = jnp.where(members, refined[None], -jnp.inf).max(1)
+    ranges = jnp.linalg.norm(candidates.boxes.center[:, :2], axis=-1)
+    weights = _gaussian(iou, _sigma_squared(ranges, sigma_squared, distances)[:, None]) * candidates.iou[None]
+    boxes = _average(candidates.boxes, jnp.where(members, weights, 0), align=False)
+    return Clusters(boxes, score, keep & (ranges < distances[-1]))
+
+
+def paper_di_nms(
+    candidates: Candidates,
+    *,
+    overlap: float,
+    support_threshold: Float[Array, " K"],
+    sigma_squared: tuple[float, ...],
+    distances: tuple[float, ...],
+) -> Clusters:
+    """DI-NMS as the paper has it (Algorithm 1).
+
+    Candidates must come in order of their score, which is reported too. A suppressed box belongs to the first
+    kept box that overlaps it; support and average run over those. A cluster without enough support is removed.
+    Each auxiliary box is weighted by the sigma of its own distance, its yaw first aligned to the candidate
+    modulo pi.
+    """
+    iou, real = _class_overlap(candidates)
+    overlaps = (iou > overlap) & real
+    keep = greedy_keep(overlaps, candidates.valid)
+    # argmax finds the first kept candidate that overlaps each box; a kept one is its own.
+    owner = jnp.argmax(overlaps & keep[:, None], axis=0)
+    slots = jnp.arange(owner.shape[0], dtype=owner.dtype)
+    members = overlaps & keep[:, None] & (owner[None] == slots[:, None])
+    support = jnp.where(members, iou * candidates.iou[None], 0).sum(1)
+    ranges = jnp.linalg.norm(candidates.boxes.center[:, :2], axis=-1)
+    weights = _gaussian(iou, _sigma_squared(ranges, sigma_squared, distances)[None]) * candidates.iou[None]
+    boxes = _average(candidates.boxes, jnp.where(members, weights, 0), align=True)
+    return Clusters(boxes, candidates.score, keep & (support > support_threshold))
+
+
+def refine_by_anchor_distance(candidates: Candidates) -> Candidates:
+    """Lower the score of boxes far from their anchor and sort by it (Algorithm 1, line 2; SPEC section 10.2).
+
+    S = f * (1 - softmax(distance)) over the candidates of the scene, distance in metres.
+    """
+    score = candidates.score * (1 - _masked_softmax(candidates.anchor_distance, candidates.valid))
+    order = jnp.argsort(jnp.where(candidates.valid, score, -jnp.inf), descending=True, stable=True)
+    return jax.tree.map(lambda leaf: leaf[order], candidates._replace(score=score))
+
+
+def _class_overlap(candidates: Candidates) -> tuple[Float[Array, "K K"], Bool[Array, "K K"]]:
+    """IoU between candidates of one class, zero between classes, and which pairs are real and of one class."""
+    count = candidates.valid.sum(dtype=jnp.int32)
+    same = candidates.label[:, None] == candidates.label[None]
+    same &= candidates.valid[:, None] & candidates.valid[None]
+    return jnp.where(same, pairwise_iou(candidates.boxes, count), 0), same
+
+
+def _masked_softmax(values: Float[Array, " K"], valid: Bool[Array, " K"]) -> Float[Array, " K"]:
+    """Softmax over the valid entries, zero elsewhere and where there is none."""
+    top = jnp.max(values, where=valid, initial=-jnp.inf)
+    powers = jnp.where(valid, jnp.exp(jnp.where(valid, values - top, 0)), 0)
+    return powers / jnp.maximum(powers.sum(), 1)
+
+
+def _sigma_squared(ranges: Array, sigma_squared: tuple[float, ...], distances: tuple[float, ...]) -> Array:
+    """Sigma squared by the BEV distance of a box; a distance itself belongs to the farther band."""
+    band = sum((ranges >= limit).astype(jnp.int32) for limit in distances)
+    return jnp.array(sigma_squared, ranges.dtype)[band]
+
+
+def _gaussian(iou: Array, sigma_squared: Array) -> Array:
+    """Weight exp(-(1 - IoU)^2 / sigma^2) of an auxiliary box (paper equation 8)."""
+    return jnp.exp(-((1 - iou) ** 2) / sigma_squared)
+
+
+def _average(boxes: Boxes, weights: Float[Array, "K K"], *, align: bool) -> Boxes:
+    """Weighted mean of the boxes for every row of weights; a row without weight keeps its own box."""
+    total = weights.sum(1)
+    usable = total != 0
+    share = weights / jnp.where(usable, total, 1)[:, None]
+    own = boxes.to_array()
+    # Differences from the row's own box are small: the mean loses no digits.
+    offset = own[None] - own[:, None]
+    if align:
+        turn = offset[..., 6]
+        offset = offset.at[..., 6].set(turn - jnp.round(turn / jnp.pi) * jnp.pi)
+    mean = own + jnp.where(usable[:, None], (share[..., None] * offset).sum(1), 0)
+    return Boxes.from_array(mean)

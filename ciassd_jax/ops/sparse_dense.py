@@ -1,0 +1,55 @@
+"""Sparse 3D convolution by its definition: a dense grid and a mask (DESIGN section 3).
+
+The same functions as in `sparse.py` on whole grids. They are the oracle of the tests and serve small grids.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ciassd_jax.ops.sparse import NO_SITE, Triple, linear_keys, to_dense
+from ciassd_jax.types import Sites
+
+
+def strided_sites(
+    sites: Sites, *, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple, capacity: int
+) -> tuple[Sites, Int[Array, ""]]:
+    """Sites of a strided convolution: where the kernel-sized maximum of the input's mask is set."""
+    mask = to_dense((sites.keys != NO_SITE).astype(jnp.int32)[:, None], sites, shape=shape)[..., 0]
+    pads = [(p, p) for p in padding]
+    active = lax.reduce_window(mask, 0, lax.max, kernel, stride, pads) > 0
+    # Ascending keys: y slowest, then x, then z.
+    y, x, z = jnp.nonzero(active.transpose(1, 2, 0), size=capacity, fill_value=-1)
+    keys = linear_keys(jnp.stack([z, y, x], -1).astype(jnp.int32), out_shape)
+    found = active.sum(dtype=jnp.int32)
+    return Sites(jnp.where(y < 0, NO_SITE, keys), jnp.minimum(found, capacity)), jnp.maximum(found - capacity, 0)
+
+
+def convolve(
+    features: Float[Array, "U C"],
+    sites: Sites,
+    out_sites: Sites,
+    kernel: Float[Array, "K C O"],
+    *,
+    shape: Triple,
+    out_shape: Triple,
+    kernel_size: Triple,
+    stride: Triple,
+    padding: Triple,
+) -> Float[Array, "V O"]:
+    """Dense cross-correlation of the scattered features, read at the output sites; padding rows are zero."""
+    real = (sites.keys != NO_SITE)[:, None]
+    grid = to_dense(jnp.where(real, features, 0), sites, shape=shape)
+    dense = lax.conv_general_dilated(
+        grid[None],
+        kernel.reshape(*kernel_size, *kernel.shape[1:]),
+        stride,
+        [(p, p) for p in padding],
+        dimension_numbers=("NDHWC", "DHWIO", "NDHWC"),
+        precision=lax.Precision.HIGHEST,
+    )[0]
+    by_key = dense.transpose(1, 2, 0, 3).reshape(-1, dense.shape[-1])
+    real = out_sites.keys != NO_SITE
+    return jnp.where(real[:, None], by_key[jnp.where(real, out_sites.keys, 0)], 0)

@@ -1,0 +1,102 @@
+"""Voxelisation with fixed capacity (SPEC section 3): points in, mean of the first points of each voxel out."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ciassd_jax.ops.sparse import NO_SITE, Triple, coordinates_of, linear_keys
+from ciassd_jax.types import PointCloud, SparseVoxels
+
+Vector = tuple[float, float, float]
+
+
+def voxel_coordinates(
+    points: Float[Array, "P 3"], *, minimum: Vector, voxel_size: Vector, cells: Triple
+) -> tuple[Int[Array, "P 3"], Bool[Array, " P"]]:
+    """Voxel (z, y, x) of each point and whether it lies in the grid of `cells` (x, y, z).
+
+    Exactly floor((p - minimum) / size) in float32. KITTI's coordinates are whole millimetres and often sit on a
+    cell border, where a multiplication by the reciprocal would move them to a neighbour.
+    """
+    offset = points.astype(jnp.float32) - jnp.array(minimum, jnp.float32)[None]
+    # Behind the barrier the compiler sees no constant, and so no reciprocal to multiply by.
+    size = lax.optimization_barrier(jnp.broadcast_to(jnp.array(voxel_size, jnp.float32), offset.shape))
+    index = jnp.floor(offset / size)
+    inside = ((index >= 0) & (index < jnp.array(cells, jnp.float32)[None])).all(-1)
+    return jnp.where(inside[:, None], index, 0).astype(jnp.int32)[:, ::-1], inside
+
+
+def voxelize(
+    cloud: PointCloud,
+    *,
+    minimum: Vector,
+    voxel_size: Vector,
+    cells: Triple,
+    shape: Triple,
+    max_points: int,
+    max_voxels: int,
+    overflow: Literal["skip", "stop"],
+) -> SparseVoxels:
+    """Group points into voxels and average the first `max_points` of each, in the order of the cloud.
+
+    Points that are not finite or outside the grid of `cells` (x, y, z) do not count. Beyond `max_voxels` the
+    voxels that the cloud touches first stay; "stop" also ignores every point after the one that met the limit
+    (the released code). `shape` (z, y, x) defines the linear keys and may have more layers than `cells`.
+    """
+    capacity = cloud.points.shape[0]
+    slots = jnp.arange(capacity, dtype=jnp.int32)
+    coordinates, inside = voxel_coordinates(
+        cloud.points[:, :3], minimum=minimum, voxel_size=voxel_size, cells=cells
+    )
+    inside &= (slots < cloud.count) & jnp.isfinite(cloud.points).all(-1)
+    keys = jnp.where(inside, linear_keys(coordinates, shape), NO_SITE)
+    # A stable sort keeps the order of the cloud within a voxel.
+    keys, order = lax.sort((keys, slots), num_keys=1, is_stable=True)
+    is_first = (keys != jnp.concatenate([jnp.full(1, -1, jnp.int32), keys[:-1]])) & (keys != NO_SITE)
+    touched = is_first.sum(dtype=jnp.int32)
+    # The point that would open voxel number max_voxels + 1; none when all voxels fit.
+    first_touches = jnp.sort(jnp.where(is_first, order, capacity))
+    limit = first_touches[max_voxels] if max_voxels < capacity else jnp.int32(capacity)
+
+    kept = is_first & (order < limit)
+    rank = jnp.cumsum(kept, dtype=jnp.int32)
+    count = rank[-1]
+    voxel = jnp.arange(max_voxels, dtype=jnp.int32)
+    real = voxel < count
+    start = jnp.minimum(jnp.searchsorted(rank, voxel + 1).astype(jnp.int32), capacity - 1)
+    # Slots of the voxel's first points in the sorted list: they share its key.
+    member = jnp.minimum(start[:, None] + jnp.arange(max_points, dtype=jnp.int32)[None], capacity - 1)
+    distinct = start[:, None] + jnp.arange(max_points, dtype=jnp.int32)[None] < capacity
+    used = real[:, None] & distinct & (keys[member] == keys[start][:, None])
+    if overflow == "stop":
+        used &= order[member] < limit
+    num_points = used.sum(1, dtype=jnp.int32)
+    values = jnp.where(used[..., None], cloud.points[order[member]], 0)
+    total = jnp.broadcast_to(jnp.maximum(num_points, 1).astype(values.dtype)[:, None], values[:, 0].shape)
+    in_range = inside.sum(dtype=jnp.int32)
+    return SparseVoxels(
+        features=values.sum(1) / total,
+        coordinates=jnp.where(real[:, None], coordinates_of(keys[start], shape), 0),
+        num_points=num_points,
+        first_point=jnp.where(real, order[start], capacity),
+        count=count,
+        dropped=touched - count,
+        points_in_range=in_range,
+        points_dropped=in_range - _points_in_kept_voxels(keys, kept, is_first, order, limit, overflow),
+    )
+
+
+def _points_in_kept_voxels(
+    keys: Array, kept: Array, is_first: Array, order: Array, limit: Array, overflow: str
+) -> Int[Array, ""]:
+    """Number of points whose voxel was kept; with "stop", of those before the limit."""
+    slots = jnp.arange(keys.shape[0], dtype=jnp.int32)
+    start_of_run = lax.cummax(jnp.where(is_first, slots, 0))
+    in_kept = kept[start_of_run] & (keys != NO_SITE)
+    if overflow == "stop":
+        in_kept &= order < limit
+    return in_kept.sum(dtype=jnp.int32)

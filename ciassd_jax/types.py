@@ -1,0 +1,135 @@
+"""Records that cross the boundary between two stages.
+
+Every record is a NamedTuple of arrays. Shapes are given for one scene; a batch is the same record with a
+leading axis B on every leaf. Padding comes last and is inert.
+
+Letters: B scenes, P points, V voxel or site slots, A anchors, G truth boxes, K candidates, D detections,
+H W cells of the bird's-eye-view (BEV) map, C channels, S strided stages of the backbone.
+
+Frame: LiDAR, x forward, y left, z up, metres. Yaw is counter-clockwise from +x, in radians.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+Array = jax.Array | np.ndarray
+
+
+class PointCloud(NamedTuple):
+    """Points as x, y, z in metres and intensity in [0, 1]; the first `count` rows are real."""
+
+    points: Float[Array, "*b P 4"]
+    count: Int[Array, "*b"]
+
+
+class Boxes(NamedTuple):
+    """Boxes by geometric centre (x, y, z), size (length, width, height) and yaw."""
+
+    center: Float[Array, "*b 3"]
+    size: Float[Array, "*b 3"]
+    yaw: Float[Array, "*b"]
+
+    @classmethod
+    def from_array(cls, array: Float[Array, "*b 7"]) -> Boxes:
+        """Read (x, y, z, length, width, height, yaw) from the last axis."""
+        return cls(array[..., :3], array[..., 3:6], array[..., 6])
+
+    def to_array(self) -> Float[Array, "*b 7"]:
+        """Write (x, y, z, length, width, height, yaw) on a last axis."""
+        numpy = all(isinstance(leaf, np.ndarray) for leaf in self)
+        parts = [self.center, self.size, self.yaw[..., None]]
+        return np.concatenate(parts, -1) if numpy else jnp.concatenate(parts, -1)
+
+
+class SparseVoxels(NamedTuple):
+    """Occupied voxels in ascending order of their linear key (y, x, z with z fastest).
+
+    `coordinates` are (z, y, x). `first_point` is the index of the point that touched the voxel first.
+    `dropped` counts voxels over capacity, `points_dropped` the points in range that went with them.
+    """
+
+    features: Float[Array, "*b V C"]
+    coordinates: Int[Array, "*b V 3"]
+    num_points: Int[Array, "*b V"]
+    first_point: Int[Array, "*b V"]
+    count: Int[Array, "*b"]
+    dropped: Int[Array, "*b"]
+    points_in_range: Int[Array, "*b"]
+    points_dropped: Int[Array, "*b"]
+
+
+class Sites(NamedTuple):
+    """Active sites of one grid by ascending linear key; padding has the largest int32 and comes last."""
+
+    keys: Int[Array, "*b V"]
+    count: Int[Array, "*b"]
+
+
+class NeighbourTable(NamedTuple):
+    """Which input site each kernel offset reads, and its transpose for the backward pass.
+
+    `inputs[o, k]` is the input site under offset k of output site o, `outputs[i, k]` the output site that
+    reads input site i through offset k. Where there is none, the number of input (output) slots stands.
+    """
+
+    inputs: Int[Array, "*b V K"]
+    outputs: Int[Array, "*b U K"]
+
+
+class Predictions(NamedTuple):
+    """What the network says of every anchor, before any decoding.
+
+    `box` holds the residuals in the paper's order (x, y, z, w, l, h, r), `class_logit` the logit of the
+    anchor's own class, `direction` two logits, `iou` the raw IoU output in about [-1, 1].
+    """
+
+    box: Float[Array, "*b A 7"]
+    class_logit: Float[Array, "*b A"]
+    direction: Float[Array, "*b A 2"]
+    iou: Float[Array, "*b A"]
+
+
+class Counts(NamedTuple):
+    """How much of a scene was used, and how much every fixed capacity had to drop."""
+
+    points_given: Int[Array, "*b"]
+    points_in_range: Int[Array, "*b"]
+    points_dropped: Int[Array, "*b"]
+    voxels_kept: Int[Array, "*b"]
+    voxels_dropped: Int[Array, "*b"]
+    sites_kept: Int[Array, "*b S"]
+    sites_dropped: Int[Array, "*b S"]
+    candidates_kept: Int[Array, "*b"]
+    candidates_dropped: Int[Array, "*b"]
+
+
+class Candidates(NamedTuple):
+    """Decoded anchors above the score threshold, best confidence first.
+
+    `score` is the rectified confidence f = c * q**beta, `iou` the predicted IoU q, `anchor_distance` the
+    BEV distance in metres between the box centre and its anchor's centre, `direction` the class (0 or 1).
+    """
+
+    boxes: Boxes
+    score: Float[Array, "*b K"]
+    iou: Float[Array, "*b K"]
+    anchor_distance: Float[Array, "*b K"]
+    direction: Int[Array, "*b K"]
+    label: Int[Array, "*b K"]
+    valid: Bool[Array, "*b K"]
+
+
+class Detections(NamedTuple):
+    """Final boxes in the order of their selection; the first `count` rows are real, the others zero."""
+
+    boxes: Boxes
+    score: Float[Array, "*b D"]
+    label: Int[Array, "*b D"]
+    count: Int[Array, "*b"]
+    counts: Counts
