@@ -1,1 +1,25 @@
-"""CIA-SSD in JAX."""
+"""LiDAR 3D object detection in JAX: CIA-SSD as pure functions with fixed shapes."""
+
+from ciassd_jax.config import Config, car, car_released, three_class, tiny
+from ciassd_jax.model.detector import init_variables
+from ciassd_jax.prediction import Detector, predict
+from ciassd_jax.types import Boxes, Detections, PointCloud
+from ciassd_jax.weights import load_weights, save_weights
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Boxes",
+    "Config",
+    "Detections",
+    "Detector",
+    "PointCloud",
+    "car",
+    "car_released",
+    "init_variables",
+    "load_weights",
+    "predict",
+    "save_weights",
+    "three_class",
+    "tiny",
+]

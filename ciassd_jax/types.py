@@ -25,7 +25,7 @@ class PointCloud(NamedTuple):
     """Points as x, y, z in metres and intensity in [0, 1]; the first `count` rows are real."""
 
     points: Float[Array, "*b P 4"]
-    count: Int[Array, "*b"]
+    count: Int[Array, "*b"]  # type: ignore[assignment]
 
 
 class Boxes(NamedTuple):
@@ -51,14 +51,15 @@ class SparseVoxels(NamedTuple):
     """Occupied voxels in ascending order of their linear key (y, x, z with z fastest).
 
     `coordinates` are (z, y, x). `first_point` is the index of the point that touched the voxel first.
-    `dropped` counts voxels over capacity, `points_dropped` the points in range that went with them.
+    `dropped` counts voxels over capacity, `points_dropped` the points that went with them and those that are
+    not finite.
     """
 
     features: Float[Array, "*b V C"]
     coordinates: Int[Array, "*b V 3"]
     num_points: Int[Array, "*b V"]
     first_point: Int[Array, "*b V"]
-    count: Int[Array, "*b"]
+    count: Int[Array, "*b"]  # type: ignore[assignment]
     dropped: Int[Array, "*b"]
     points_in_range: Int[Array, "*b"]
     points_dropped: Int[Array, "*b"]
@@ -68,7 +69,7 @@ class Sites(NamedTuple):
     """Active sites of one grid by ascending linear key; padding has the largest int32 and comes last."""
 
     keys: Int[Array, "*b V"]
-    count: Int[Array, "*b"]
+    count: Int[Array, "*b"]  # type: ignore[assignment]
 
 
 class NeighbourTable(NamedTuple):
@@ -96,7 +97,11 @@ class Predictions(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """How much of a scene was used, and how much every fixed capacity had to drop."""
+    """How much of a scene was used, and how much every fixed capacity had to drop.
+
+    `points_dropped` are those that are not finite and those in range whose voxel was over capacity; points beyond
+    the fixed number per voxel are not among them: the method leaves them out by design.
+    """
 
     points_given: Int[Array, "*b"]
     points_in_range: Int[Array, "*b"]
@@ -131,5 +136,5 @@ class Detections(NamedTuple):
     boxes: Boxes
     score: Float[Array, "*b D"]
     label: Int[Array, "*b D"]
-    count: Int[Array, "*b"]
+    count: Int[Array, "*b"]  # type: ignore[assignment]
     counts: Counts

@@ -68,7 +68,7 @@ def _as_points(array: np.ndarray, path: Pathlike) -> Float32[np.ndarray, "N 4"]:
     points = np.zeros((len(array), 4), np.float32)
     columns = min(array.shape[1], 4)
     if columns == 3:
-        warnings.warn(f"{path} has no intensity; 0 is used instead.", stacklevel=3)
+        warnings.warn(f"{path} has no intensity; 0 is used instead.", stacklevel=4)
     points[:, :columns] = array[:, :columns]
     return points
 
@@ -146,7 +146,7 @@ def _read_pcd_ascii(
     try:
         values = np.array(body.split(), np.float64)
     except ValueError as error:
-        raise FormatError(f"{path} has a point that is no number ({error}); save it again.") from error
+        raise FormatError(f"{path} has a point that is no number; save it again.") from error
     if values.size != header.num_points * header.columns:
         raise FormatError(
             f"{path} announces {header.num_points} points of {header.columns} numbers "
@@ -184,7 +184,7 @@ def _read_pcd_header(data: bytes, path: Pathlike) -> tuple[_PcdHeader, bytes]:
         return _parse_pcd_header(entries), stream.read()
     except (LookupError, TypeError, ValueError) as error:
         raise FormatError(
-            f"{path} has a malformed PCD header ({error}); "
+            f"{path} has a malformed PCD header ({str(error)[:80]}); "
             "save it again with FIELDS, SIZE, TYPE, WIDTH, HEIGHT, POINTS and DATA."
         ) from error
 

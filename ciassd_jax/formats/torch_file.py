@@ -1,9 +1,9 @@
 """Reader of PyTorch weights files, without PyTorch and without running anything that a file asks for.
 
-Both formats are read: the zip archive (`NAME/data.pkl` and a record `NAME/data/KEY` for each storage) and the
-older row of pickles with the raw storages behind them. The work has two steps. `_Recorder` only notes what the
-file says: every name that it may mention (`_GLOBALS`) stands for a string or for an inert object of this module,
-and every other name is an error. Then `_Resolver` checks the notes and turns them into arrays.
+Both formats are read: the zip archive (`NAME/data.pkl` and a record `NAME/data/KEY` for each storage) and
+the older row of pickles with the raw storages behind them. The work has two steps. `_Recorder` only notes
+what the file says: every name that it may mention (`_GLOBALS`) stands for a string or an inert object of
+this module, and every other name is an error. Then `_Resolver` checks the notes and turns them into arrays.
 """
 
 import io
@@ -47,9 +47,9 @@ _DTYPES = {
 def read_torch_file(path: str | os.PathLike[str]) -> dict[Any, Any]:
     """The content of a file written by `torch.save`, as plain data.
 
-    Containers, numbers, strings, bytes and None are returned as they are (an `OrderedDict` as a `dict`, a NumPy
-    scalar as a number, a torch dtype or device as its name) and every tensor as an array of its type, bfloat16 as
-    float32. The arrays of tensors are read-only; those that share a storage share memory.
+    Containers, numbers, strings, bytes and None are returned as they are (an `OrderedDict` as a `dict`, a
+    NumPy scalar as a number, a torch dtype or device as its name) and a tensor as an array of its type,
+    bfloat16 as float32. The arrays of tensors are read-only; those that share a storage share memory.
 
     Raises FormatError for everything else: a missing, foreign or damaged file, or one that asks to run code.
     """
@@ -61,9 +61,8 @@ def read_torch_file(path: str | os.PathLike[str]) -> dict[Any, Any]:
         return content
     except FormatError as error:
         raise FormatError(f"{path} {error}") from None
-    except (
-        Exception
-    ) as error:  # pickle, zipfile, zlib, struct and NumPy raise a dozen kinds for malformed bytes
+    except Exception as error:
+        # Malformed bytes make pickle, zipfile, zlib, struct and NumPy raise a dozen kinds of error.
         raise FormatError(f"{path} is damaged or is no PyTorch weights file; {_AGAIN}") from error
 
 
@@ -168,9 +167,7 @@ class _Recorder(pickle._Unpickler):
 
     def persistent_load(self, pid: Any) -> Any:
         match pid:
-            case ("storage", str(dtype), str(key), _, int(count), *view) if (
-                dtype in _DTYPES and len(view) < 2
-            ):
+            case ("storage", str(dtype), str(key), _, int(count), *view) if dtype in _DTYPES:
                 self.storage_dtypes.setdefault(key, _DTYPES[dtype])
                 return _Record(_storage, key, dtype, count, *view)
         raise FormatError(f"describes a storage in an unknown way; {_AGAIN}")
@@ -258,8 +255,8 @@ def _parameter(resolver: _Resolver, data: Any, *flags_and_hooks: Any) -> Any:
 
 
 def _numpy_dtype(resolver: _Resolver, code: Any, align: Any, copy: Any, state: Any) -> np.dtype:
-    """A type of plain numbers or characters; NumPy would take any address for an object."""
-    if not re.fullmatch(r"[biufcSU]\d{1,4}", code) or state[1] not in ("<", ">", "|", "="):
+    """A type of numbers or characters, never of objects: NumPy would take any bytes for their addresses."""
+    if not re.fullmatch(r"[biufcSU][1-9][0-9]{0,3}", code) or state[1] not in ("<", ">", "|", "="):
         raise FormatError(f"holds a NumPy array of something other than numbers; {_ALONE}")
     return np.dtype(state[1] + code)
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
@@ -30,3 +33,20 @@ class CIASSD(nn.Module):
         features = SSFA(config.neck, dtype, self.axis_name, name="neck")(bev, train=train)
         head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, name="head")
         return head(features), kept, dropped
+
+
+def init_variables(key: Array, config: Config) -> Any:
+    """Fresh {"params", "batch_stats"}, initialised as in the released code; the whole tree is float32."""
+    none = jnp.zeros(1, jnp.int32)
+    slot = jnp.zeros((1, 1), jnp.int32)
+    voxels = SparseVoxels(
+        features=jnp.zeros((1, 1, 4)),
+        coordinates=jnp.zeros((1, 1, 3), jnp.int32),
+        num_points=slot,
+        first_point=slot,
+        count=none,
+        dropped=none,
+        points_in_range=none,
+        points_dropped=none,
+    )
+    return jax.jit(CIASSD(config).init)(key, voxels)

@@ -30,7 +30,12 @@ def intersection_bev(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
     cosine, sine = xp.cos(b.yaw - a.yaw), xp.sin(b.yaw - a.yaw)
     u, v = b.size[..., 0] / 2, b.size[..., 1] / 2
     ux, uy, vx, vy = u * cosine, u * sine, -v * sine, v * cosine
-    starts = [(x - ux - vx, y - uy - vy), (x + ux - vx, y + uy - vy), (x + ux + vx, y + uy + vy), (x - ux + vx, y - uy + vy)]
+    starts = [
+        (x - ux - vx, y - uy - vy),
+        (x + ux - vx, y + uy - vy),
+        (x + ux + vx, y + uy + vy),
+        (x - ux + vx, y - uy + vy),
+    ]
     steps = [(2 * ux, 2 * uy), (2 * vx, 2 * vy), (-2 * ux, -2 * uy), (-2 * vx, -2 * vy)]
 
     twice = xp.zeros_like(x + p + u)
@@ -50,7 +55,14 @@ def intersection_bev(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
 
 
 def _clip(
-    xp: ModuleType, s: Array, e: Array, s_other: Array, e_other: Array, half: Array, edges: list[list], left: int
+    xp: ModuleType,
+    s: Array,
+    e: Array,
+    s_other: Array,
+    e_other: Array,
+    half: Array,
+    edges: list[list],
+    left: int,
 ) -> tuple[Array, Array, Array]:
     """Clip the edge s + t * e to |.| <= half, and the edges of `a` on these two lines to its left side.
 

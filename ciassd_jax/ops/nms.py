@@ -67,9 +67,7 @@ def greedy_keep(overlaps: Bool[Array, "K K"], eligible: Bool[Array, " K"]) -> Bo
     return lax.while_loop(lambda state: state[1], step, (eligible, jnp.array(True)))[0]
 
 
-def rotated_nms(
-    candidates: Candidates, *, overlap: float, limit: int | None = None
-) -> Clusters:
+def rotated_nms(candidates: Candidates, *, overlap: float, limit: int | None = None) -> Clusters:
     """Plain NMS within each class: a kept box suppresses later ones of IoU at or above `overlap`.
 
     `limit` keeps the first so many only. Boxes and scores stay as they are.

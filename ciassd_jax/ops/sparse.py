@@ -56,7 +56,14 @@ def sort_unique(keys: Int[Array, " N"], *, capacity: int) -> tuple[Sites, Int[Ar
 
 
 def strided_sites(
-    sites: Sites, *, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple, capacity: int
+    sites: Sites,
+    *,
+    shape: Triple,
+    out_shape: Triple,
+    kernel: Triple,
+    stride: Triple,
+    padding: Triple,
+    capacity: int,
 ) -> tuple[Sites, Int[Array, ""]]:
     """Sites of a strided convolution: every output whose window holds an active input.
 
@@ -87,7 +94,14 @@ def submanifold_table(sites: Sites, *, shape: Triple) -> NeighbourTable:
 
 
 def strided_table(
-    sites: Sites, out_sites: Sites, *, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple
+    sites: Sites,
+    out_sites: Sites,
+    *,
+    shape: Triple,
+    out_shape: Triple,
+    kernel: Triple,
+    stride: Triple,
+    padding: Triple,
 ) -> NeighbourTable:
     """Neighbours of a strided convolution from `sites` to `out_sites`, offsets in C order (z, y, x)."""
     strides, paddings = jnp.array(stride, jnp.int32), jnp.array(padding, jnp.int32)
@@ -251,7 +265,9 @@ def to_dense(features: Float[Array, "V C"], sites: Sites, *, shape: Triple) -> F
     depth, height, width = shape
     cells = depth * height * width
     # Padding writes outside of the grid, each slot to a place of its own, and is dropped there.
-    place = jnp.where(sites.keys == NO_SITE, cells + jnp.arange(sites.keys.shape[0], dtype=jnp.int32), sites.keys)
+    place = jnp.where(
+        sites.keys == NO_SITE, cells + jnp.arange(sites.keys.shape[0], dtype=jnp.int32), sites.keys
+    )
     flat = jnp.zeros((cells, features.shape[-1]), features.dtype)
     flat = flat.at[place].set(features, mode="drop", unique_indices=True, indices_are_sorted=True)
     return flat.reshape(height, width, depth, -1).transpose(2, 0, 1, 3)

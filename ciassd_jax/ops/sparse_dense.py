@@ -14,7 +14,14 @@ from ciassd_jax.types import Sites
 
 
 def strided_sites(
-    sites: Sites, *, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple, capacity: int
+    sites: Sites,
+    *,
+    shape: Triple,
+    out_shape: Triple,
+    kernel: Triple,
+    stride: Triple,
+    padding: Triple,
+    capacity: int,
 ) -> tuple[Sites, Int[Array, ""]]:
     """Sites of a strided convolution: where the kernel-sized maximum of the input's mask is set."""
     mask = to_dense((sites.keys != NO_SITE).astype(jnp.int32)[:, None], sites, shape=shape)[..., 0]
@@ -24,7 +31,9 @@ def strided_sites(
     y, x, z = jnp.nonzero(active.transpose(1, 2, 0), size=capacity, fill_value=-1)
     keys = linear_keys(jnp.stack([z, y, x], -1).astype(jnp.int32), out_shape)
     found = active.sum(dtype=jnp.int32)
-    return Sites(jnp.where(y < 0, NO_SITE, keys), jnp.minimum(found, capacity)), jnp.maximum(found - capacity, 0)
+    return Sites(jnp.where(y < 0, NO_SITE, keys), jnp.minimum(found, capacity)), jnp.maximum(
+        found - capacity, 0
+    )
 
 
 def convolve(

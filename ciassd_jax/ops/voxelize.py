@@ -43,7 +43,7 @@ def voxelize(
 ) -> SparseVoxels:
     """Group points into voxels and average the first `max_points` of each, in the order of the cloud.
 
-    Points that are not finite or outside the grid of `cells` (x, y, z) do not count. Beyond `max_voxels` the
+    Points outside the grid of `cells` (x, y, z) do not count, nor do those that are not finite. Beyond `max_voxels` the
     voxels that the cloud touches first stay; "stop" also ignores every point after the one that met the limit
     (the released code). `shape` (z, y, x) defines the linear keys and may have more layers than `cells`.
     """
@@ -52,7 +52,8 @@ def voxelize(
     coordinates, inside = voxel_coordinates(
         cloud.points[:, :3], minimum=minimum, voxel_size=voxel_size, cells=cells
     )
-    inside &= (slots < cloud.count) & jnp.isfinite(cloud.points).all(-1)
+    given, finite = slots < cloud.count, jnp.isfinite(cloud.points).all(-1)
+    inside &= given & finite
     keys = jnp.where(inside, linear_keys(coordinates, shape), NO_SITE)
     # A stable sort keeps the order of the cloud within a voxel.
     keys, order = lax.sort((keys, slots), num_keys=1, is_stable=True)
@@ -86,7 +87,9 @@ def voxelize(
         count=count,
         dropped=touched - count,
         points_in_range=in_range,
-        points_dropped=in_range - _points_in_kept_voxels(keys, kept, is_first, order, limit, overflow),
+        points_dropped=(given & ~finite).sum(dtype=jnp.int32)
+        + in_range
+        - _points_in_kept_voxels(keys, kept, is_first, order, limit, overflow),
     )
 
 
