@@ -77,8 +77,7 @@ class StageConfig:
     def __post_init__(self) -> None:
         if self.channels < 1 or self.layers < 0 or self.capacity < 1 or self.z_padding not in (0, 1):
             raise ValueError(
-                f"backbone stage {self}: channels and capacity must be at least 1, layers at least 0, "
-                "z_padding 0 or 1."
+                f"backbone stage {self}: channels and capacity must be at least 1, layers at least 0, z_padding 0 or 1."
             )
 
 
@@ -108,9 +107,7 @@ class BackboneConfig:
         shapes = [shape]
         for stage in self.stages[1:]:
             depth, height, width = shapes[-1]
-            shapes.append(
-                ((depth + 2 * stage.z_padding - 3) // 2 + 1, (height - 1) // 2 + 1, (width - 1) // 2 + 1)
-            )
+            shapes.append(((depth + 2 * stage.z_padding - 3) // 2 + 1, (height - 1) // 2 + 1, (width - 1) // 2 + 1))
         depth, height, width = shapes[-1]
         shapes.append(((depth - 3) // 2 + 1, height, width))
         return tuple(shapes)
@@ -188,9 +185,7 @@ class DetectionConfig:
         if self.max_candidates < 1:
             raise ValueError("detection.max_candidates must be at least 1.")
         if self.nms not in ("paper", "released", "rotated"):
-            raise ValueError(
-                f"detection.nms: {self.nms!r} is unknown; choose 'paper', 'released' or 'rotated'."
-            )
+            raise ValueError(f"detection.nms: {self.nms!r} is unknown; choose 'paper', 'released' or 'rotated'.")
         if min(self.sigma_squared) <= 0 or list(self.sigma_distances) != sorted(self.sigma_distances):
             raise ValueError("detection: sigma_squared must be positive and sigma_distances ascending.")
 
@@ -286,9 +281,7 @@ def _build(kind: Any, data: Any, where: str) -> Any:
         kinds = [arguments[0]] * len(data) if arguments[-1] is Ellipsis else list(arguments)
         if len(kinds) != len(data):
             raise ValueError(f"{where}: expected {len(kinds)} values, not {len(data)}.")
-        return tuple(
-            _build(k, item, f"{where}[{i}]") for i, (k, item) in enumerate(zip(kinds, data, strict=True))
-        )
+        return tuple(_build(k, item, f"{where}[{i}]") for i, (k, item) in enumerate(zip(kinds, data, strict=True)))
     if origin is Literal:
         if data not in arguments:
             raise ValueError(f"{where}: {data!r} is not one of {list(arguments)}.")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ciassd_jax.config import ClassConfig, DetectionConfig
 from ciassd_jax.ops import boxes as box_ops
 from ciassd_jax.ops import camera, nms
-from ciassd_jax.types import Boxes, Candidates, Predictions
+from ciassd_jax.types import Array, Boxes, Candidates, Predictions
 
 RANGE_AXES = tuple[float, float]
 

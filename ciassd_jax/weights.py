@@ -28,10 +28,22 @@ Tensors = Mapping[str, np.ndarray]
 Variables = Any
 FORMAT = "ciassd_jax weights 1"
 
-_SPARSE_LAYERS = (
-    "stage0_0 stage0_1 stage1_down stage1_0 stage1_1 stage2_down stage2_0 stage2_1 stage2_2 "
-    "stage3_down stage3_0 stage3_1 stage3_2 out"
-).split()
+_SPARSE_LAYERS = [
+    "stage0_0",
+    "stage0_1",
+    "stage1_down",
+    "stage1_0",
+    "stage1_1",
+    "stage2_down",
+    "stage2_0",
+    "stage2_1",
+    "stage2_2",
+    "stage3_down",
+    "stage3_0",
+    "stage3_1",
+    "stage3_2",
+    "out",
+]
 # Our layer, the released convolution and its BatchNorm, below `neck`.
 _NECK_LAYERS = {
     "spatial_0": ("bottom_up_block_0.1", "bottom_up_block_0.2"),
@@ -141,9 +153,7 @@ def _read_safetensors(path: str | os.PathLike[str]) -> tuple[Tensors, dict[str, 
         with safetensors.safe_open(path, framework="numpy") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (safetensors.SafetensorError, OSError) as error:
-        raise FormatError(
-            f"{path} is no complete safetensors file ({error}); fetch or write it again."
-        ) from error
+        raise FormatError(f"{path} is no complete safetensors file ({error}); fetch or write it again.") from error
 
 
 def _ours(tensors: Tensors, config: Config, path: str | os.PathLike[str]) -> Weights:
@@ -243,9 +253,7 @@ def _assemble(
         elif target in named and not np.isfinite(named[target]).all():
             row = row._replace(status="not finite")
         checked.append(row)
-    checked += [
-        r._replace(status="unexpected") for r in report if r.status != "counter" and r.target not in expected
-    ]
+    checked += [r._replace(status="unexpected") for r in report if r.status != "counter" and r.target not in expected]
     wrong = [r for r in checked if r.status not in ("mapped", "transposed", "counter")]
     if wrong:
         shown = "; ".join(f"{r.source or r.target} {r.shape}: {r.status}" for r in wrong[:3])

@@ -78,9 +78,7 @@ def read_calibration(path: Pathlike) -> Calibration:
     for keys, shape in _MATRICES:
         found = [lines[key] for key in keys if key in lines]
         if not found:
-            raise FormatError(
-                f"{path} has no line {keys[0]}; use the calibration file that KITTI gives for the frame."
-            )
+            raise FormatError(f"{path} has no line {keys[0]}; use the calibration file that KITTI gives for the frame.")
         try:
             matrix = np.array(found[0], np.float64).reshape(shape)
             usable = bool(np.isfinite(matrix).all()) and abs(np.linalg.det(matrix[:, :3])) > 1e-6
@@ -130,9 +128,7 @@ def read_rows(path: Pathlike) -> list[ObjectRow]:
 
 def _parse_row(columns: list[str], place: str) -> ObjectRow:
     if len(columns) not in (15, 16):
-        raise FormatError(
-            f"{place}: {len(columns)} columns; a label has 15 and a result 16, so write it again."
-        )
+        raise FormatError(f"{place}: {len(columns)} columns; a label has 15 and a result 16, so write it again.")
     try:
         occluded = int(columns[2])
         truncated, _, alpha, *values = (float(column) for column in columns[1:])
@@ -159,9 +155,7 @@ def format_row(row: ObjectRow) -> str:
     values = [row.alpha, *row.bbox, *row.dimensions, *row.location, row.rotation_y]
     if row.score is not None:
         values.append(row.score)
-    return " ".join(
-        [row.type, f"{row.truncated:.4f}", f"{row.occluded}", *(f"{value:.4f}" for value in values)]
-    )
+    return " ".join([row.type, f"{row.truncated:.4f}", f"{row.occluded}", *(f"{value:.4f}" for value in values)])
 
 
 def write_rows(path: Pathlike, rows: Iterable[ObjectRow]) -> None:

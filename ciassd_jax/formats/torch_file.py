@@ -8,7 +8,6 @@ this module, and every other name is an error. Then `_Resolver` checks the notes
 
 import io
 import math
-import os
 import pickle
 import re
 import struct
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ciassd_jax.formats.errors import FormatError, read_bytes
+from ciassd_jax.formats.errors import FormatError, Pathlike, read_bytes
 
 _OLD_MAGIC, _OLD_PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
 _AGAIN = "fetch the file again or save it again with `torch.save`."
@@ -39,12 +38,10 @@ _STORAGES = {
     "ShortStorage": "int16",
 }
 # A bfloat16 is read as its bits, the upper half of a float32.
-_DTYPES = {
-    name: np.dtype("uint16" if name == "bfloat16" else name).newbyteorder("<") for name in _STORAGES.values()
-}
+_DTYPES = {name: np.dtype("uint16" if name == "bfloat16" else name).newbyteorder("<") for name in _STORAGES.values()}
 
 
-def read_torch_file(path: str | os.PathLike[str]) -> dict[Any, Any]:
+def read_torch_file(path: Pathlike) -> dict[Any, Any]:
     """The content of a file written by `torch.save`, as plain data.
 
     Containers, numbers, strings, bytes and None are returned as they are (an `OrderedDict` as a `dict`, a
@@ -256,7 +253,7 @@ def _parameter(resolver: _Resolver, data: Any, *flags_and_hooks: Any) -> Any:
 
 def _numpy_dtype(resolver: _Resolver, code: Any, align: Any, copy: Any, state: Any) -> np.dtype:
     """A type of numbers or characters, never of objects: NumPy would take any bytes for their addresses."""
-    if not re.fullmatch(r"[biufcSU][1-9][0-9]{0,3}", code) or state[1] not in ("<", ">", "|", "="):
+    if not re.fullmatch("[biufc][1248]|c16|[SU][1-9][0-9]{0,3}", code) or state[1] not in tuple("<>|="):
         raise FormatError(f"holds a NumPy array of something other than numbers; {_ALONE}")
     return np.dtype(state[1] + code)
 

@@ -7,13 +7,13 @@ from functools import partial
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from ciassd_jax.config import BackboneConfig
 from ciassd_jax.model.layers import Convolution, SparseConvNormRelu
 from ciassd_jax.ops import sparse, sparse_dense
 from ciassd_jax.ops.sparse import Triple
-from ciassd_jax.types import Sites, SparseVoxels
+from ciassd_jax.types import Array, Sites, SparseVoxels
 
 
 class SPConvNet(nn.Module):
@@ -38,16 +38,12 @@ class SPConvNet(nn.Module):
             if i > 0:
                 step = _Strided(shapes[i - 1], shapes[i], (3, 3, 3), (2, 2, 2), (stage.z_padding, 1, 1))
                 sites, convolution, lost = step.plan(sites, stage.capacity, self.config.backend)
-                x = layer(stage.channels, (3, 3, 3), name=f"stage{i}_down")(
-                    x, convolution, _real(sites), train=train
-                )
+                x = layer(stage.channels, (3, 3, 3), name=f"stage{i}_down")(x, convolution, _real(sites), train=train)
                 kept.append(sites.count)
                 dropped.append(lost)
             convolution = _submanifold(sites, shapes[i], self.config.backend) if stage.layers else None
             for j in range(stage.layers):
-                x = layer(stage.channels, (3, 3, 3), name=f"stage{i}_{j}")(
-                    x, convolution, _real(sites), train=train
-                )
+                x = layer(stage.channels, (3, 3, 3), name=f"stage{i}_{j}")(x, convolution, _real(sites), train=train)
         step = _Strided(shapes[-2], shapes[-1], (3, 1, 1), (2, 1, 1), (0, 0, 0))
         sites, convolution, lost = step.plan(sites, self.config.out_capacity, self.config.backend)
         x = layer(self.config.out_channels, (3, 1, 1), name="out")(x, convolution, _real(sites), train=train)
@@ -58,9 +54,7 @@ class SPConvNet(nn.Module):
 class _Strided:
     """Geometry of one strided convolution."""
 
-    def __init__(
-        self, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple
-    ) -> None:
+    def __init__(self, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple) -> None:
         self.geometry = {"shape": shape, "out_shape": out_shape, "stride": stride, "padding": padding}
         self.kernel = kernel
 

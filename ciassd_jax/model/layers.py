@@ -9,7 +9,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+
+from ciassd_jax.types import Array
 
 Initializer = Callable[..., Array]
 Convolution = Callable[[Array, Array], Array]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from ciassd_jax.types import Boxes
+from ciassd_jax.types import Array, Boxes
 
 
 def wrap_angle(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:

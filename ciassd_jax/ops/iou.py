@@ -51,7 +51,8 @@ def intersection_bev(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
     for half, edges in ((p, on_x), (q, on_y)):
         for low, high, weight in edges:
             twice = twice + xp.maximum(high - low, 0) * weight * half
-    return xp.maximum(twice, 0) / 2
+    # A point has edges without direction, of which no side is outside.
+    return xp.where(u * v == 0, 0, xp.maximum(twice, 0) / 2)
 
 
 def _clip(

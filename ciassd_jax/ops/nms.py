@@ -11,10 +11,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ciassd_jax.ops.iou import iou_bev
-from ciassd_jax.types import Boxes, Candidates
+from ciassd_jax.types import Array, Boxes, Candidates
 
 _TILE = 128
 

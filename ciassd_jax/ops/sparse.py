@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt32
 
-from ciassd_jax.types import NeighbourTable, Sites
+from ciassd_jax.types import Array, NeighbourTable, Sites
 
 Triple = tuple[int, int, int]
 NO_SITE = np.int32(np.iinfo(np.int32).max)
@@ -122,24 +122,55 @@ def _site_indices(sites: Sites, keys: Int[Array, "*n"], wanted: Bool[Array, "*n"
     return jnp.where(wanted & (sites.keys[position] == keys), position, slots)
 
 
+def _column_map(sites: Sites, *, shape: Triple) -> UInt32[Array, "columns words+1"]:
+    """For every BEV column (y, x): a bit for each active z, in words of 32, and the slot of its lowest site.
+
+    With it a site is found in constant time: its slot is the column's first plus the number of set bits below.
+    """
+    depth, height, width = shape
+    words = -(-depth // 32)
+    slots = sites.keys.shape[0]
+    column, z = sites.keys // depth, sites.keys % depth
+    word = jnp.arange(words, dtype=jnp.int32)[None]
+    bits = jnp.where((z // 32)[:, None] == word, jnp.uint32(1) << (z % 32).astype(jnp.uint32)[:, None], jnp.uint32(0))
+    # Gather the bits of a column in its first site: its sites are adjacent, at most `depth` of them.
+    for step in (2**i for i in range((depth - 1).bit_length())):
+        same = jnp.pad(column[step:], (0, min(step, slots)), constant_values=-1)[:slots] == column
+        later = jnp.pad(bits[step:], ((0, min(step, slots)), (0, 0)))[:slots]
+        bits = bits | jnp.where(same[:, None], later, jnp.uint32(0))
+    slot = jnp.arange(slots, dtype=jnp.int32)
+    is_first = (column != jnp.concatenate([jnp.full(1, -1, jnp.int32), column[:-1]])) & (sites.keys != NO_SITE)
+    place = jnp.where(is_first, column, height * width + slot)
+    entry = jnp.concatenate([bits, slot.astype(jnp.uint32)[:, None]], 1)
+    empty = jnp.zeros((height * width, words + 1), jnp.uint32)
+    return empty.at[place].set(entry, mode="drop", unique_indices=True)
+
+
 def _window_indices(
     sites: Sites, corner: Int[Array, "V 3"], real: Bool[Array, " V"], *, shape: Triple, kernel: Triple
 ) -> Int[Array, "V K"]:
     """Slots of the sites in the windows that start at `corner` (z, y, x), in C order of the kernel."""
     depth, height, width = shape
     slots = sites.keys.shape[0]
-    padded = jnp.pad(sites.keys, (0, kernel[0]), constant_values=NO_SITE)
     offset_y, offset_x = (jnp.array(o, jnp.int32) for o in zip(*np.ndindex(*kernel[1:]), strict=True))
-    z, y, x = corner[:, :1], corner[:, 1:2] + offset_y[None], corner[:, 2:] + offset_x[None]
+    y, x = corner[:, 1:2] + offset_y[None], corner[:, 2:] + offset_x[None]
     inside = real[:, None] & (y >= 0) & (y < height) & (x >= 0) & (x < width)
-    first = (y * width + x) * depth + z
-    position = jnp.searchsorted(sites.keys, first).astype(jnp.int32)
+    columns = _column_map(sites, shape=shape)
+    entry = columns.at[jnp.where(inside, y * width + x, 0)].get(mode="promise_in_bounds")
+    words, start = entry[..., :-1], entry[..., -1].astype(jnp.int32)
     found = []
     for dz in range(kernel[0]):
-        # Keys are distinct and ascending: the search moves on only past a key that was there.
-        hit = padded.at[position].get(mode="promise_in_bounds") == first + dz
-        found.append(jnp.where(hit & inside & (z + dz >= 0) & (z + dz < depth), position, slots))
-        position = position + hit.astype(jnp.int32)
+        z = corner[:, :1] + dz
+        at = jnp.where((z >= 0) & (z < depth), z, 0)
+        below, active = jnp.zeros(start.shape, jnp.int32), jnp.zeros(start.shape, bool)
+        for i in range(words.shape[-1]):
+            bit = (at - 32 * i).clip(0, 31).astype(jnp.uint32)
+            lower = jnp.where(at < 32 * (i + 1), (jnp.uint32(1) << bit) - 1, jnp.uint32(0xFFFFFFFF))
+            lower = jnp.where(at < 32 * i, jnp.uint32(0), lower)
+            below += lax.population_count(words[..., i] & lower).astype(jnp.int32)
+            active |= (at // 32 == i) & ((words[..., i] >> bit) & 1 == 1)
+        active &= inside & (z >= 0) & (z < depth)
+        found.append(jnp.where(active, start + below, slots))
     return jnp.stack(found, 1).reshape(corner.shape[0], -1)
 
 
@@ -151,9 +182,7 @@ def flatten_scenes(table: NeighbourTable) -> NeighbourTable:
         first = slots * jnp.arange(scenes, dtype=jnp.int32)[:, None, None]
         return jnp.where(index < slots, index + first, scenes * slots).reshape(-1, index.shape[-1])
 
-    return NeighbourTable(
-        flatten(table.inputs, table.outputs.shape[1]), flatten(table.outputs, table.inputs.shape[1])
-    )
+    return NeighbourTable(flatten(table.inputs, table.outputs.shape[1]), flatten(table.outputs, table.inputs.shape[1]))
 
 
 @jax.custom_vjp
@@ -265,9 +294,7 @@ def to_dense(features: Float[Array, "V C"], sites: Sites, *, shape: Triple) -> F
     depth, height, width = shape
     cells = depth * height * width
     # Padding writes outside of the grid, each slot to a place of its own, and is dropped there.
-    place = jnp.where(
-        sites.keys == NO_SITE, cells + jnp.arange(sites.keys.shape[0], dtype=jnp.int32), sites.keys
-    )
+    place = jnp.where(sites.keys == NO_SITE, cells + jnp.arange(sites.keys.shape[0], dtype=jnp.int32), sites.keys)
     flat = jnp.zeros((cells, features.shape[-1]), features.dtype)
     flat = flat.at[place].set(features, mode="drop", unique_indices=True, indices_are_sorted=True)
     return flat.reshape(height, width, depth, -1).transpose(2, 0, 1, 3)

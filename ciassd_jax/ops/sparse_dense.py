@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from ciassd_jax.ops.sparse import NO_SITE, Triple, linear_keys, to_dense
-from ciassd_jax.types import Sites
+from ciassd_jax.types import Array, Sites
 
 
 def strided_sites(
@@ -24,16 +24,14 @@ def strided_sites(
     capacity: int,
 ) -> tuple[Sites, Int[Array, ""]]:
     """Sites of a strided convolution: where the kernel-sized maximum of the input's mask is set."""
-    mask = to_dense((sites.keys != NO_SITE).astype(jnp.int32)[:, None], sites, shape=shape)[..., 0]
+    mask = to_dense((sites.keys != NO_SITE).astype(jnp.float32)[:, None], sites, shape=shape)[..., 0]
     pads = [(p, p) for p in padding]
-    active = lax.reduce_window(mask, 0, lax.max, kernel, stride, pads) > 0
+    active = lax.reduce_window(mask, 0.0, lax.max, kernel, stride, pads) > 0
     # Ascending keys: y slowest, then x, then z.
     y, x, z = jnp.nonzero(active.transpose(1, 2, 0), size=capacity, fill_value=-1)
     keys = linear_keys(jnp.stack([z, y, x], -1).astype(jnp.int32), out_shape)
     found = active.sum(dtype=jnp.int32)
-    return Sites(jnp.where(y < 0, NO_SITE, keys), jnp.minimum(found, capacity)), jnp.maximum(
-        found - capacity, 0
-    )
+    return Sites(jnp.where(y < 0, NO_SITE, keys), jnp.minimum(found, capacity)), jnp.maximum(found - capacity, 0)
 
 
 def convolve(

@@ -6,10 +6,10 @@ from typing import Literal
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ciassd_jax.ops.sparse import NO_SITE, Triple, coordinates_of, linear_keys
-from ciassd_jax.types import PointCloud, SparseVoxels
+from ciassd_jax.types import Array, PointCloud, SparseVoxels
 
 Vector = tuple[float, float, float]
 
@@ -49,9 +49,7 @@ def voxelize(
     """
     capacity = cloud.points.shape[0]
     slots = jnp.arange(capacity, dtype=jnp.int32)
-    coordinates, inside = voxel_coordinates(
-        cloud.points[:, :3], minimum=minimum, voxel_size=voxel_size, cells=cells
-    )
+    coordinates, inside = voxel_coordinates(cloud.points[:, :3], minimum=minimum, voxel_size=voxel_size, cells=cells)
     given, finite = slots < cloud.count, jnp.isfinite(cloud.points).all(-1)
     inside &= given & finite
     keys = jnp.where(inside, linear_keys(coordinates, shape), NO_SITE)

@@ -171,14 +171,14 @@ def is_plain(value: Any) -> bool:
         return type(value) in (list, tuple) and all(map(is_plain, value))
     if isinstance(value, np.ndarray):
         return value.dtype.kind in "biufcSU"
+    if isinstance(value, np.dtype):
+        return value.kind in "biufcSU"
     return value is None or type(value) in (bool, int, float, complex, str, bytes)
 
 
 def sample() -> dict[str, Any]:
     """A small checkpoint with every part that the real ones have."""
-    loss = Call(
-        Name("numpy.core.multiarray", "scalar"), (numpy_dtype("f8"), latin(np.float64(0.5).tobytes()))
-    )
+    loss = Call(Name("numpy.core.multiarray", "scalar"), (numpy_dtype("f8"), latin(np.float64(0.5).tobytes())))
     weights = {
         "a.weight": whole("0", np.arange(6, dtype=np.float32).reshape(2, 3)),
         "a.step": whole("1", np.int64([7])),
@@ -268,9 +268,7 @@ def test_parameters_sizes_devices_and_types(write: Writer, tmp_path: Path) -> No
     data = whole("0", np.float32([1, 2]))
     content = {
         "parameter": Call(Name("torch._utils", "_rebuild_parameter"), (data, True, ordered({}))),
-        "stateful": Call(
-            Name("torch._utils", "_rebuild_parameter_with_state"), (data, True, ordered({}), {"a": 1})
-        ),
+        "stateful": Call(Name("torch._utils", "_rebuild_parameter_with_state"), (data, True, ordered({}), {"a": 1})),
         "size": Call(Name("torch", "Size"), ((2, 3),)),
         "device": Call(Name("torch", "device"), ("cuda", 0)),
         "cpu": Call(Name("torch", "device"), ("cpu",)),
@@ -322,9 +320,12 @@ def test_numpy_values(write: Writer, tmp_path: Path, protocol: int) -> None:
         "bool": np.array([True, False]),
         "scalar": np.float32(1.5),
         "count": np.int64(-3),
+        "complex": np.complex128(1 + 2j),
+        "type": np.dtype("float32"),
     }
     read = read_torch_file(write(tmp_path / "w.pth", values, protocol=protocol))
-    assert (read.pop("scalar"), read.pop("count")) == (1.5, -3)
+    for name in ("scalar", "count", "complex", "type"):
+        assert read.pop(name) == values[name]
     for name, array in read.items():
         assert array.dtype.isnative
         np.testing.assert_array_equal(array, values[name])
@@ -476,9 +477,7 @@ def test_state_cannot_be_set(write: Writer, tmp_path: Path, target: Any, state: 
         (0, ((2,),), ((1,),)),
     ],
 )
-def test_tensors_outside_their_storage(
-    write: Writer, tmp_path: Path, offset: Any, size: Any, stride: Any
-) -> None:
+def test_tensors_outside_their_storage(write: Writer, tmp_path: Path, offset: Any, size: Any, stride: Any) -> None:
     storage = Storage("0", np.arange(6, dtype=np.float32))
     refused(write(tmp_path / "w.pth", {"w": tensor(storage, offset, size, stride)}))
 
@@ -496,13 +495,9 @@ def test_a_view_is_read_exactly_if_it_lies_inside(
     values = np.arange(8, dtype=np.int64)
     valid = len(size) == len(stride) and min([offset, *size, *stride]) >= 0
     if valid and 0 not in size:
-        places = [
-            offset + sum(i * s for i, s in zip(index, stride, strict=True)) for index in np.ndindex(*size)
-        ]
+        places = [offset + sum(i * s for i, s in zip(index, stride, strict=True)) for index in np.ndindex(*size)]
         valid = max(places) < 8
-    path = WRITERS[kind](
-        tmp_path / "w.pth", {"w": tensor(Storage("0", values), offset, tuple(size), tuple(stride))}
-    )
+    path = WRITERS[kind](tmp_path / "w.pth", {"w": tensor(Storage("0", values), offset, tuple(size), tuple(stride))})
     if not valid:
         refused(path)
     elif 0 in size:

@@ -1,0 +1,201 @@
+"""`Detector`: a network with its weights, for notebooks and the command line."""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ciassd_jax.config import Config
+from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.prediction import predict, variables_of
+from ciassd_jax.types import Counts, PointCloud
+from ciassd_jax.weights import Variables, load_weights
+
+BUNDLED = Path(__file__).parent / "bundled"
+# Half-spaces that hold every point: no camera, no frustum.
+ANYWHERE = np.tile(np.array([0, 0, 0, 1], np.float32), (6, 1))
+
+
+class DroppedWarning(UserWarning):
+    """Part of the input was not used; the message says how much and why."""
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """Detections of one frame as NumPy arrays.
+
+    `boxes` [N, 7] are x, y, z, length, width, height (metres) and yaw in [-pi, pi), in the LiDAR frame and the order
+    of selection; `labels` are class names; `seconds` is the time from points to boxes without compilation.
+    """
+
+    boxes: np.ndarray
+    scores: np.ndarray
+    labels: tuple[str, ...]
+    counts: dict[str, Any]
+    seconds: float
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def __repr__(self) -> str:
+        head = f"{len(self)} detections in {1e3 * self.seconds:.0f} ms"
+        rows = [
+            f"  {label:<10} {score:.2f}  at ({x:6.2f}, {y:6.2f}, {z:5.2f})  {length:.2f} x {width:.2f} x {height:.2f} m"
+            f"  yaw {yaw:+.2f}"
+            for label, score, (x, y, z, length, width, height, yaw) in zip(
+                self.labels[:10], self.scores, self.boxes, strict=False
+            )
+        ]
+        more = [f"  ... and {len(self) - 10} more"] if len(self) > 10 else []
+        return "\n".join([head, *rows, *more])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, strings and lists, ready for JSON."""
+        return {
+            "boxes": self.boxes.tolist(),
+            "scores": self.scores.tolist(),
+            "labels": list(self.labels),
+            "counts": self.counts,
+            "seconds": self.seconds,
+        }
+
+
+class Detector:
+    """A network with its weights: points in, detections out.
+
+    Clouds are padded to a bucket of points and the program is compiled once per bucket.
+    """
+
+    # Points per bucket; four times as many for ever larger clouds.
+    smallest_bucket = 32768
+
+    def __init__(self, variables: Variables, config: Config) -> None:
+        self.config = config
+        self._variables = jax.device_put(variables_of(variables))
+        self._programs: dict[int, jax.stages.Compiled] = {}
+
+    @classmethod
+    def from_pretrained(cls, path_or_name: str | os.PathLike[str]) -> Detector:
+        """Load a weights file (`.safetensors` of ours or a released `.pth`), or bundled weights by name."""
+        weights = load_weights(find_weights(path_or_name))
+        return cls(weights.variables, weights.config)
+
+    def __call__(
+        self, points: np.ndarray | Sequence[np.ndarray], *, frustum: np.ndarray | None = None
+    ) -> FrameResult | list[FrameResult]:
+        """Detections in points [N, 4] (x, y, z in metres, intensity), or one result for each of a list of them.
+
+        `frustum` [6, 4] (`ops.camera.frustum_planes`) drops boxes outside the camera's view. Warns where points,
+        voxels, sites or candidates were dropped, and divides intensities of 0..255 by 255.
+        """
+        if not isinstance(points, np.ndarray | jax.Array):
+            return [self._detect(np.asarray(cloud), frustum) for cloud in points]
+        return self._detect(np.asarray(points), frustum)
+
+    def compile(self, num_points: int) -> jax.stages.Compiled:
+        """The program for clouds of up to so many points, compiled on first use."""
+        bucket = self._bucket(num_points)
+        if bucket not in self._programs:
+            cloud = PointCloud(np.zeros((1, bucket, 4), np.float32), np.zeros(1, np.int32))
+            step = jax.jit(predict, static_argnames="config")
+            self._programs[bucket] = step.lower(self._variables, cloud, self.config, frustum=ANYWHERE[None]).compile()
+        return self._programs[bucket]
+
+    def _bucket(self, num_points: int) -> int:
+        bucket = self.smallest_bucket
+        while bucket < num_points:
+            bucket *= 4
+        return bucket
+
+    def _detect(self, points: np.ndarray, frustum: np.ndarray | None) -> FrameResult:
+        points = _check_points(points)
+        program = self.compile(len(points))
+        start = time.perf_counter()
+        padded = np.zeros((1, self._bucket(len(points)), 4), np.float32)
+        padded[0, : len(points)] = points
+        cloud = PointCloud(padded, np.array([len(points)], np.int32))
+        planes = ANYWHERE if frustum is None else np.asarray(frustum, np.float32)
+        batch = jax.device_get(program(self._variables, cloud, frustum=planes[None]))
+        seconds = time.perf_counter() - start
+        scene = jax.tree.map(lambda leaf: leaf[0], batch)
+        counts = _plain_counts(scene.counts)
+        _warn_of_drops(counts, int((~np.isfinite(points).all(1)).sum()))
+        n = int(scene.count)
+        names = self.config.class_names
+        boxes = scene.boxes.to_array()[:n]
+        return FrameResult(boxes, scene.score[:n], tuple(names[i] for i in scene.label[:n]), counts, seconds)
+
+
+def find_weights(path_or_name: str | os.PathLike[str]) -> Path:
+    """A path as it is; the file of bundled weights for a name without suffix or folder."""
+    path = Path(path_or_name)
+    if path.suffix or len(path.parts) > 1:
+        return path
+    bundled = sorted(p.stem for p in BUNDLED.glob("*.safetensors"))
+    if path.name not in bundled:
+        have = f"bundled are {', '.join(bundled)}" if bundled else "none are bundled yet"
+        raise FormatError(f"{path.name!r} names no bundled weights ({have}); give the path of a weights file.")
+    return BUNDLED / f"{path.name}.safetensors"
+
+
+def _check_points(points: np.ndarray) -> np.ndarray:
+    """Points as float32 [N, 4] with intensity in [0, 1]."""
+    if points.ndim != 2 or points.shape[1] != 4:
+        raise ValueError(f"points have the shape {points.shape}; give [N, 4]: x, y, z in metres and intensity.")
+    points = np.asarray(points, np.float32)
+    intensity = points[:, 3]
+    top = intensity.max(initial=0, where=np.isfinite(intensity))
+    if top > 2:
+        warnings.warn(
+            f"{len(points)} intensities of up to {top:g} were divided by 255: the network reads [0, 1].",
+            DroppedWarning,
+            stacklevel=4,
+        )
+        points = np.concatenate([points[:, :3], points[:, 3:] / 255], 1)
+    return points
+
+
+def _plain_counts(counts: Counts) -> dict[str, Any]:
+    """Counts of one scene as nested plain numbers."""
+    value = {name: np.asarray(leaf).tolist() for name, leaf in counts._asdict().items()}
+    return {
+        "points": {name: value[f"points_{name}"] for name in ("given", "in_range", "dropped")},
+        "voxels": {name: value[f"voxels_{name}"] for name in ("kept", "dropped")},
+        "sites": [
+            {"kept": kept, "dropped": dropped}
+            for kept, dropped in zip(value["sites_kept"], value["sites_dropped"], strict=True)
+        ],
+        "candidates": {name: value[f"candidates_{name}"] for name in ("kept", "dropped")},
+    }
+
+
+def _warn_of_drops(counts: dict[str, Any], not_finite: int) -> None:
+    """One warning that names everything that was not used; none where all was."""
+    lost = []
+    points, voxels = counts["points"], counts["voxels"]
+    if not_finite:
+        lost.append(f"{not_finite} of {points['given']} points that are not finite")
+    if not points["in_range"]:
+        lost.append(f"all {points['given']} points, none of which is in range")
+    if voxels["dropped"]:
+        lost.append(
+            f"{voxels['dropped']} voxels beyond the {voxels['kept']} that fit (grid.max_voxels), with "
+            f"{points['dropped'] - not_finite} points"
+        )
+    lost += [
+        f"{stage['dropped']} sites of backbone stage {i + 1} beyond the {stage['kept']} that fit (its capacity)"
+        for i, stage in enumerate(counts["sites"])
+        if stage["dropped"]
+    ]
+    if counts["candidates"]["dropped"]:
+        lost.append(f"{counts['candidates']['dropped']} candidates beyond detection.max_candidates")
+    if lost:
+        warnings.warn("Dropped " + "; ".join(lost) + ".", DroppedWarning, stacklevel=4)

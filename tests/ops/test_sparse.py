@@ -1,0 +1,421 @@
+"""Sparse convolution: gathered equals dense equals a loop equals the released code; and its properties."""
+
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from oracles import sparse_convolution_loop
+
+from ciassd_jax.ops import sparse, sparse_dense
+from ciassd_jax.ops.sparse import NO_SITE
+from ciassd_jax.types import NeighbourTable, Sites
+
+
+class Geometry(NamedTuple):
+    kernel: tuple[int, int, int]
+    stride: tuple[int, int, int]
+    padding: tuple[int, int, int]
+
+    def out_shape(self, shape):
+        zipped = zip(shape, self.kernel, self.stride, self.padding, strict=True)
+        return tuple((n + 2 * p - k) // s + 1 for n, k, s, p in zipped)
+
+
+SUBMANIFOLD = Geometry((3, 3, 3), (1, 1, 1), (1, 1, 1))
+DOWN = Geometry((3, 3, 3), (2, 2, 2), (1, 1, 1))
+DOWN_NO_Z_PADDING = Geometry((3, 3, 3), (2, 2, 2), (0, 1, 1))
+DOWN_Z = Geometry((3, 1, 1), (2, 1, 1), (0, 0, 0))
+LAYERS = {"submanifold": SUBMANIFOLD, "down": DOWN, "down_no_z_padding": DOWN_NO_Z_PADDING, "down_z": DOWN_Z}
+
+# The encoder in small: every type of layer that it has.
+PLAN = (SUBMANIFOLD, DOWN, SUBMANIFOLD, DOWN_NO_Z_PADDING, SUBMANIFOLD, DOWN_Z)
+CHANNELS = (3, 4, 4, 5, 4, 4, 3)
+
+
+def random_coordinates(seed: int, shape, number: int) -> np.ndarray:
+    """Distinct (z, y, x) by ascending key, borders included."""
+    cells = np.random.default_rng(seed).choice(np.prod(shape), number, replace=False)
+    return by_key(np.stack(np.unravel_index(cells, shape), -1))
+
+
+def by_key(coordinates: np.ndarray) -> np.ndarray:
+    """The same (z, y, x) with y slowest, then x, then z."""
+    return coordinates[np.lexsort(coordinates[:, [0, 2, 1]].T)].astype(np.int32)
+
+
+def sites_of(coordinates: np.ndarray, shape, capacity: int) -> Sites:
+    keys = np.asarray(sparse.linear_keys(jnp.array(coordinates), shape))
+    padding = np.full(capacity - len(keys), NO_SITE, np.int32)
+    return Sites(jnp.concatenate([keys, padding]), jnp.int32(len(keys)))
+
+
+def coordinates_of(sites: Sites, shape) -> np.ndarray:
+    return np.asarray(sparse.coordinates_of(sites.keys, shape))[: int(sites.count)]
+
+
+def random_features(seed: int, rows: int, channels: int = CHANNELS[0]) -> jax.Array:
+    """One row for every slot, padding included: nothing may read that."""
+    return jnp.array(np.random.default_rng(seed).normal(size=(rows, channels)), jnp.float32)
+
+
+def random_kernels(seed: int, plan=PLAN) -> list[jax.Array]:
+    """Kernels [K, C, O] that about keep the scale of the features."""
+    rng = np.random.default_rng(seed)
+    sizes = [(np.prod(g.kernel), c, o) for g, c, o in zip(plan, CHANNELS, CHANNELS[1:], strict=False)]
+    return [jnp.array(rng.normal(size=size) / np.sqrt(size[0] * size[1]), jnp.float32) for size in sizes]
+
+
+def gathered_layer(sites, features, kernel, shape, geometry, capacity):
+    """Sites after the layer, how many were dropped, and their features."""
+    if geometry == SUBMANIFOLD:
+        return sites, jnp.int32(0), sparse.convolve(features, sparse.submanifold_table(sites, shape=shape), kernel)
+    where = {"shape": shape, "out_shape": geometry.out_shape(shape), **geometry._asdict()}
+    out_sites, dropped = sparse.strided_sites(sites, capacity=capacity, **where)
+    return out_sites, dropped, sparse.convolve(features, sparse.strided_table(sites, out_sites, **where), kernel)
+
+
+def dense_layer(sites, features, kernel, shape, geometry, capacity):
+    """The same by definition."""
+    window, where = geometry._asdict(), {"shape": shape, "out_shape": geometry.out_shape(shape)}
+    out_sites, dropped = sites, jnp.int32(0)
+    if geometry != SUBMANIFOLD:
+        out_sites, dropped = sparse_dense.strided_sites(sites, capacity=capacity, **where, **window)
+    window["kernel_size"] = window.pop("kernel")
+    return out_sites, dropped, sparse_dense.convolve(features, sites, out_sites, kernel, **where, **window)
+
+
+def flat_layer(sites, features, kernel, shape, geometry, capacity):
+    """The same for a batch [B, V], whose features [B * V, C] are the rows of all scenes."""
+    if geometry == SUBMANIFOLD:
+        tables = jax.vmap(partial(sparse.submanifold_table, shape=shape))(sites)
+        return sites, jnp.zeros(1, jnp.int32), sparse.convolve(features, sparse.flatten_scenes(tables), kernel)
+    where = {"shape": shape, "out_shape": geometry.out_shape(shape), **geometry._asdict()}
+    out_sites, dropped = jax.vmap(partial(sparse.strided_sites, capacity=capacity, **where))(sites)
+    tables = jax.vmap(partial(sparse.strided_table, **where))(sites, out_sites)
+    return out_sites, dropped, sparse.convolve(features, sparse.flatten_scenes(tables), kernel)
+
+
+run_gathered = partial(jax.jit, static_argnames=("shape", "geometry", "capacity"))(gathered_layer)
+run_dense = partial(jax.jit, static_argnames=("shape", "geometry", "capacity"))(dense_layer)
+run_batch = partial(jax.jit, static_argnames=("shape", "geometry", "capacity"))(flat_layer)
+
+
+@partial(jax.jit, static_argnames=("layer", "shape", "capacities"))
+def run_plan(layer, sites, features, kernels, *, shape, capacities):
+    """Sites, dropped counts and features after every layer, and a sum's gradients by features and kernels."""
+
+    def total(features, kernels):
+        here, at, stages = shape, sites, []
+        for geometry, kernel, capacity in zip(PLAN, kernels, capacities, strict=True):
+            at, dropped, features = layer(at, features, kernel, here, geometry, capacity)
+            here = geometry.out_shape(here)
+            stages.append((at, dropped, features))
+        return sum((f * jnp.cos(jnp.arange(f.size, dtype=f.dtype).reshape(f.shape))).sum() for *_, f in stages), stages
+
+    gradients, stages = jax.grad(total, argnums=(0, 1), has_aux=True)(features, kernels)
+    return stages, gradients
+
+
+# Odd and even sizes with capacities that always suffice, and with ones that overflow at every stage.
+GRIDS = {
+    "odd": ((13, 7, 9), (819, 350, 350, 100, 100, 60)),
+    "even": ((14, 8, 6), (672, 300, 300, 100, 100, 60)),
+    "tall": ((41, 5, 4), (820, 300, 300, 100, 100, 60)),
+    "overflowed": ((13, 7, 9), (819, 40, 40, 11, 11, 2)),
+}
+
+
+@pytest.mark.parametrize("occupied", [0.0, 0.002, 0.05, 0.4, 1.0])
+@pytest.mark.parametrize("grid", GRIDS)
+def test_gathered_equals_dense(grid, occupied):
+    shape, capacities = GRIDS[grid]
+    coordinates = random_coordinates(0, shape, round(occupied * np.prod(shape)))
+    sites = sites_of(coordinates, shape, capacities[0])
+    arguments = sites, random_features(1, capacities[0]), random_kernels(2)
+    gathered, gathered_gradients = run_plan(gathered_layer, *arguments, shape=shape, capacities=capacities)
+    dense, dense_gradients = run_plan(dense_layer, *arguments, shape=shape, capacities=capacities)
+    for (mine, dropped, features), (reference, expected_dropped, expected) in zip(gathered, dense, strict=True):
+        np.testing.assert_array_equal(mine.keys, reference.keys)
+        assert mine.count == reference.count == (np.asarray(mine.keys) != NO_SITE).sum()
+        assert dropped == expected_dropped
+        np.testing.assert_allclose(features, expected, rtol=0, atol=1e-5)
+    overflows = [int(gathered[i][1]) > 0 for i in (1, 3, 5)]
+    assert overflows == [grid == "overflowed" and occupied >= 0.05] * 3
+    assert (abs(gathered[0][2]).max() > 0.1) == (occupied > 0)
+    for mine, reference in zip(jax.tree.leaves(gathered_gradients), jax.tree.leaves(dense_gradients), strict=True):
+        scale = max(1, abs(reference).max())
+        np.testing.assert_allclose(mine / scale, reference / scale, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("capacity", [120, 20])
+@pytest.mark.parametrize("name", LAYERS)
+def test_gradients_in_float64(name, capacity):
+    geometry, shape = LAYERS[name], (5, 4, 5)
+    with jax.enable_x64(True):
+        sites = sites_of(random_coordinates(0, shape, 30), shape, 40)
+        features = random_features(1, 40).astype(jnp.float64)
+        kernel = random_kernels(2, (geometry,))[0].astype(jnp.float64)
+
+        def convolve(features, kernel):
+            return run_gathered(sites, features, kernel, shape, geometry, capacity)[2]
+
+        assert convolve(features, kernel).dtype == jnp.float64
+        check_grads(convolve, (features, kernel), order=1, modes=["rev"])
+
+
+@pytest.mark.parametrize("shape", [(7, 5, 8), (70, 2, 2)])
+@pytest.mark.parametrize("number", [0, 1, 5, 60, 280])
+@pytest.mark.parametrize("name", LAYERS)
+def test_equals_the_loop(name, number, shape):
+    geometry, capacity = LAYERS[name], 300
+    coordinates = random_coordinates(number, shape, number)
+    features, kernel = random_features(1, capacity), random_kernels(2, (geometry,))[0]
+    sites = sites_of(coordinates, shape, capacity)
+    out_sites, dropped, result = run_gathered(sites, features, kernel, shape, geometry, capacity)
+    expected_coordinates, expected = sparse_convolution_loop(
+        coordinates,
+        np.asarray(features[:number]),
+        np.asarray(kernel).reshape(*geometry.kernel, *kernel.shape[1:]),
+        geometry.stride,
+        geometry.padding,
+        shape,
+        geometry == SUBMANIFOLD,
+    )
+    found = coordinates_of(out_sites, geometry.out_shape(shape))
+    order = np.lexsort(found.T[::-1])
+    np.testing.assert_array_equal(found[order], expected_coordinates)
+    np.testing.assert_allclose(result[: len(found)][order], expected, rtol=0, atol=1e-5)
+    assert not result[len(found) :].any()
+    assert dropped == 0
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("case", ["subm3", "down_s2_p1", "down_s2_p011", "zconv_s211"])
+def test_equals_the_released_code(shared: Path, case):
+    """Two scenes of shuffled sites, brought to our order and convolved as one batch."""
+    with np.load(shared / "golden" / "sparse_tiny.npz") as file:
+        reference = {key.removeprefix(f"{case}__"): file[key] for key in file if key.startswith(case)}
+    shape, out_shape = (tuple(reference[key].tolist()) for key in ("in_shape", "out_shape"))
+    weight, coordinates = reference["weight_dhwio"], reference["in_coords_bzyx"].astype(np.int32)
+    geometry = Geometry(weight.shape[:3], *(tuple(reference[key].tolist()) for key in ("stride", "padding")))
+    if reference["submanifold"]:
+        geometry = geometry._replace(padding=(1, 1, 1))
+    assert geometry.out_shape(shape) == out_shape
+    capacity = 600
+    order = np.lexsort(coordinates[:, [1, 3, 2, 0]].T)
+    scenes = [order[coordinates[order, 0] == scene] for scene in (0, 1)]
+    sites = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *(sites_of(coordinates[rows, 1:], shape, capacity) for rows in scenes)
+    )
+    features = np.stack([np.resize(reference["in_features"][rows], (capacity, weight.shape[3])) for rows in scenes])
+    flat, kernel = jnp.array(features.reshape(2 * capacity, -1)), jnp.array(weight.reshape(-1, *weight.shape[3:]))
+    out_sites, dropped, result = run_batch(sites, flat, kernel, shape, geometry, capacity)
+    assert not dropped.any()
+    found, values = [], []
+    for scene in (0, 1):
+        at = coordinates_of(jax.tree.map(lambda leaf, scene=scene: leaf[scene], out_sites), out_shape)
+        found.append(np.insert(at, 0, scene, 1))
+        values.append(result.reshape(2, capacity, -1)[scene, : len(at)])
+    found, values = np.concatenate(found), np.concatenate(values)
+    order = np.lexsort(found.T[::-1])
+    np.testing.assert_array_equal(found[order], reference["out_coords_bzyx_sorted"])
+    np.testing.assert_allclose(values[order], reference["out_features_sorted"], rtol=0, atol=1e-5)
+
+
+def random_pairs(seed: int, inputs: int, outputs: int, offsets: int, live: np.ndarray) -> NeighbourTable:
+    """A table with no grid behind it: each offset pairs some inputs with some of the `live` outputs."""
+    rng = np.random.default_rng(seed)
+    forth, back = np.full((outputs, offsets), inputs, np.int32), np.full((inputs, offsets), outputs, np.int32)
+    for k in range(offsets):
+        number = min(inputs, len(live)) * 2 // 3
+        rows, columns = rng.permutation(live)[:number], rng.permutation(inputs)[:number]
+        forth[rows, k], back[columns, k] = columns, rows
+    return NeighbourTable(jnp.array(forth), jnp.array(back))
+
+
+@jax.jit
+def convolve_with_gradients(features, table, kernel, cotangent):
+    result, pull_back = jax.vjp(lambda f, k: sparse.convolve(f, table, k), features, kernel)
+    return result, pull_back(cotangent.astype(result.dtype))
+
+
+@pytest.mark.parametrize("live", [[], [2499], [*range(1100, 1110)], [*range(0, 2500, 7)], [*range(2500)]])
+def test_more_rows_than_one_block(live):
+    """Blocks of rows, some of them empty, in value and in both gradients."""
+    inputs, outputs, offsets = 2100, 2500, 3
+    table = random_pairs(0, inputs, outputs, offsets, np.array(live, int))
+    features, kernel = random_features(1, inputs, 4), random_features(2, offsets * 4, 5).reshape(offsets, 4, 5)
+    cotangent = random_features(3, outputs, 5)
+    result, gradients = convolve_with_gradients(features, table, kernel, cotangent)
+
+    features, kernel, cotangent = (np.asarray(a, np.float64) for a in (features, kernel, cotangent))
+    padded = np.concatenate([features, np.zeros((1, 4))])
+    gathered = padded[np.asarray(table.inputs)]
+    np.testing.assert_allclose(result, np.einsum("vkc,kco->vo", gathered, kernel), rtol=0, atol=1e-5)
+    to_features = np.zeros((inputs + 1, 4))
+    np.add.at(to_features, np.asarray(table.inputs), np.einsum("vo,kco->vkc", cotangent, kernel))
+    np.testing.assert_allclose(gradients[0], to_features[:-1], rtol=0, atol=1e-5)
+    to_kernel = np.einsum("vkc,vo->kco", gathered, cotangent)
+    np.testing.assert_allclose(gradients[1], to_kernel, rtol=1e-5, atol=1e-5 * max(1, abs(to_kernel).max()))
+
+
+@pytest.mark.parametrize("number", [3, 1000, 2400])
+def test_grids_of_more_rows_than_one_block(number):
+    shape, capacity = (12, 15, 16), 2600
+    coordinates = random_coordinates(0, shape, number)
+    sites, features = sites_of(coordinates, shape, capacity), random_features(1, capacity)
+    for geometry in (SUBMANIFOLD, DOWN):
+        arguments = sites, features, random_kernels(2, (geometry,))[0], shape, geometry, capacity
+        for mine, reference in zip(run_gathered(*arguments), run_dense(*arguments), strict=True):
+            jax.tree.map(partial(np.testing.assert_allclose, rtol=0, atol=1e-5), mine, reference)
+
+
+@pytest.mark.parametrize("geometry", [SUBMANIFOLD, DOWN])
+def test_a_batch_is_its_scenes(geometry):
+    """One flat table over scenes of 0, 40 and 200 sites gives what each scene gives alone; so does vmap."""
+    shape, capacity = (6, 7, 8), 250
+    scenes = [sites_of(random_coordinates(n, shape, n), shape, capacity) for n in (0, 40, 200)]
+    sites = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
+    features, kernel = random_features(1, 3 * capacity), random_kernels(2, (geometry,))[0]
+
+    @partial(jax.jit, static_argnames="layer")
+    def run(layer, sites, features):
+        """Result and the gradient of a sum by the features."""
+
+        def total(features):
+            result = layer(sites, features, kernel, shape, geometry, capacity)[2]
+            return jnp.sin(result).sum(), result
+
+        gradient, result = jax.grad(total, has_aux=True)(features)
+        return result, gradient
+
+    by_scene = features.reshape(3, capacity, -1)
+    flat = [a.reshape(3, capacity, -1) for a in run(flat_layer, sites, features)]
+    vmapped = jax.vmap(partial(run, gathered_layer))(sites, by_scene)
+    for i, scene in enumerate(scenes):
+        alone = run(gathered_layer, scene, by_scene[i])
+        assert bool(alone[0].any()) == (i > 0)
+        for mine, in_batch, expected in zip(flat, vmapped, alone, strict=True):
+            np.testing.assert_allclose(mine[i], expected, rtol=0, atol=1e-5)
+            np.testing.assert_allclose(in_batch[i], expected, rtol=0, atol=1e-5)
+
+
+def test_results_repeat_bit_for_bit():
+    shape, capacities = GRIDS["odd"]
+    sites = sites_of(random_coordinates(0, shape, 300), shape, capacities[0])
+    arguments = gathered_layer, sites, random_features(1, capacities[0]), random_kernels(2)
+    first, again = (run_plan(*arguments, shape=shape, capacities=capacities) for _ in range(2))
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+
+
+def test_jit_changes_nothing():
+    shape, capacity = (7, 5, 8), 300
+    sites, features = sites_of(random_coordinates(0, shape, 90), shape, capacity), random_features(1, capacity)
+    for geometry in (SUBMANIFOLD, DOWN):
+        arguments = sites, features, random_kernels(2, (geometry,))[0], shape, geometry, capacity
+        jax.tree.map(
+            partial(np.testing.assert_allclose, rtol=0, atol=1e-6), run_gathered(*arguments), gathered_layer(*arguments)
+        )
+
+
+def test_padding_is_inert():
+    """What stands in padding slots, and how many there are, changes neither values nor gradients."""
+    shape, number = (7, 5, 8), 90
+    coordinates, kernel = random_coordinates(0, shape, number), random_kernels(1, (DOWN,))[0]
+    rows, results = random_features(2, number), []
+
+    @jax.jit
+    def run(sites, features):
+        def total(features, kernel):
+            result = gathered_layer(sites, features, kernel, shape, DOWN, 200)[2]
+            return jnp.sin(result).sum(), result
+
+        gradients, result = jax.grad(total, argnums=(0, 1), has_aux=True)(features, kernel)
+        return result, *gradients
+
+    for capacity, filling in ((number, 0), (number + 1, np.nan), (1500, np.nan)):
+        features = jnp.pad(rows, ((0, capacity - number), (0, 0)), constant_values=filling)
+        result, to_features, to_kernel = run(sites_of(coordinates, shape, capacity), features)
+        assert not to_features[number:].any()
+        results.append((result, to_features[:number], to_kernel))
+    assert abs(results[0][0]).max() > 0.1
+    for other in results[1:]:
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=0, atol=1e-5), other, results[0])
+
+
+def test_shifted_sites_give_shifted_results():
+    """By 4 voxels along y and x, one cell after two strides; the features stay."""
+    shape, capacities = (13, 24, 28), (200, 600, 600, 400, 400, 200)
+    coordinates = random_coordinates(0, (13, 10, 12), 150) + np.array([0, 4, 4], np.int32)
+    features, kernels = random_features(1, capacities[0]), random_kernels(2)
+    results = []
+    for shift in (np.array([0, 0, 0], np.int32), np.array([0, 4, 0], np.int32), np.array([0, 4, 8], np.int32)):
+        sites = sites_of(coordinates + shift, shape, capacities[0])
+        stages, _ = run_plan(gathered_layer, sites, features, kernels, shape=shape, capacities=capacities)
+        assert not any(int(dropped) for _, dropped, _ in stages)
+        out_shape = shape
+        for geometry in PLAN:
+            out_shape = geometry.out_shape(out_shape)
+        results.append((coordinates_of(stages[-1][0], out_shape) - shift // 4, stages[-1][2]))
+    assert len(results[0][0]) > 10
+    for found, values in results[1:]:
+        np.testing.assert_array_equal(found, results[0][0])
+        np.testing.assert_allclose(values, results[0][1], rtol=0, atol=1e-6)
+
+
+def test_bfloat16_rounds_once():
+    """Products add up in float32: the result is off by half a unit in the last of bfloat16's 8 bits."""
+    shape, capacity = (7, 5, 8), 150
+    sites = sites_of(random_coordinates(0, shape, 140), shape, capacity)
+    table = sparse.submanifold_table(sites, shape=shape)
+    rounded = [random_features(1, capacity), random_kernels(2, (SUBMANIFOLD,))[0], random_features(3, capacity, 4)]
+    rounded = [a.astype(jnp.bfloat16) for a in rounded]
+
+    def run(dtype):
+        features, kernel, cotangent = (a.astype(dtype) for a in rounded)
+        result, gradients = convolve_with_gradients(features, table, kernel, cotangent)
+        assert result.dtype == gradients[0].dtype == gradients[1].dtype == dtype
+        return [np.asarray(leaf, np.float32) for leaf in (result, *gradients)]
+
+    for half, full in zip(run(jnp.bfloat16), run(jnp.float32), strict=True):
+        np.testing.assert_allclose(half, full, rtol=2**-8, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(3, 4, 5), (1, 7, 2), (41, 1600, 1408)])
+def test_keys_and_coordinates_are_inverse(shape):
+    """And keys ascend with y slowest, then x, then z."""
+    number = min(np.prod(shape), 1000)
+    coordinates = random_coordinates(0, shape, number)
+    coordinates[[0, -1]] = [0, 0, 0], np.array(shape) - 1
+    keys = sparse.linear_keys(jnp.array(coordinates), shape)
+    assert keys.dtype == jnp.int32
+    assert (np.diff(keys) > 0).all()
+    assert keys[-1] == np.prod(shape) - 1
+    np.testing.assert_array_equal(sparse.coordinates_of(keys, shape), coordinates)
+
+
+@pytest.mark.parametrize("capacity", [1, 5, 12, 60])
+@pytest.mark.parametrize("number", [0, 1, 12, 40])
+def test_sort_unique(capacity, number):
+    rng = np.random.default_rng(number)
+    keys = np.concatenate([rng.integers(0, 15, number), np.full(9, NO_SITE)]).astype(np.int32)
+    sites, dropped = sparse.sort_unique(jnp.array(rng.permutation(keys)), capacity=capacity)
+    distinct = np.unique(keys[:number])
+    assert sites.count == min(len(distinct), capacity)
+    assert dropped == max(len(distinct) - capacity, 0)
+    expected = np.concatenate([distinct, np.full(capacity, NO_SITE)])[:capacity]
+    np.testing.assert_array_equal(sites.keys, expected)
+
+
+def test_to_dense_puts_each_site_in_its_place():
+    shape, number = (3, 4, 5), 17
+    coordinates, features = random_coordinates(0, shape, number), random_features(1, 30)
+    grid = sparse.to_dense(features, sites_of(coordinates, shape, 30), shape=shape)
+    expected = np.zeros((*shape, features.shape[1]), np.float32)
+    expected[tuple(coordinates.T)] = features[:number]
+    np.testing.assert_array_equal(grid, expected)
