@@ -10,6 +10,7 @@ import json
 import math
 import types
 import typing
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -343,3 +344,8 @@ def tiny() -> Config:
         neck=NeckConfig(channels=16),
         detection=DetectionConfig(max_candidates=128),
     )
+
+
+PRESETS: dict[str, Callable[[], Config]] = {
+    preset.__name__: preset for preset in (car, car_released, three_class, tiny)
+}

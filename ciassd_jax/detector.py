@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -18,6 +18,9 @@ from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.prediction import predict, variables_of
 from ciassd_jax.types import Counts, PointCloud
 from ciassd_jax.weights import Variables, load_weights
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 BUNDLED = Path(__file__).parent / "bundled"
 # Half-spaces that hold every point: no camera, no frustum.
@@ -56,6 +59,12 @@ class FrameResult:
         ]
         more = [f"  ... and {len(self) - 10} more"] if len(self) > 10 else []
         return "\n".join([head, *rows, *more])
+
+    def plot_bev(self, points: np.ndarray) -> Figure:
+        """Bird's-eye view of the points [N, 4] and these boxes, as a matplotlib figure."""
+        from ciassd_jax.view.bev import plot_bev
+
+        return plot_bev(points, boxes=self.boxes, scores=self.scores)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, strings and lists, ready for JSON."""
@@ -96,27 +105,13 @@ class Detector:
         `frustum` [6, 4] (`ops.camera.frustum_planes`) drops boxes outside the camera's view. Warns where points,
         voxels, sites or candidates were dropped, and divides intensities of 0..255 by 255.
         """
-        if not isinstance(points, np.ndarray | jax.Array):
-            return [self._detect(np.asarray(cloud), frustum) for cloud in points]
-        return self._detect(np.asarray(points), frustum)
+        if isinstance(points, np.ndarray | jax.Array):
+            return self.detect(points, frustum=frustum)
+        return [self.detect(cloud, frustum=frustum) for cloud in points]
 
-    def compile(self, num_points: int) -> jax.stages.Compiled:
-        """The program for clouds of up to so many points, compiled on first use."""
-        bucket = self._bucket(num_points)
-        if bucket not in self._programs:
-            cloud = PointCloud(np.zeros((1, bucket, 4), np.float32), np.zeros(1, np.int32))
-            step = jax.jit(predict, static_argnames="config")
-            self._programs[bucket] = step.lower(self._variables, cloud, self.config, frustum=ANYWHERE[None]).compile()
-        return self._programs[bucket]
-
-    def _bucket(self, num_points: int) -> int:
-        bucket = self.smallest_bucket
-        while bucket < num_points:
-            bucket *= 4
-        return bucket
-
-    def _detect(self, points: np.ndarray, frustum: np.ndarray | None) -> FrameResult:
-        points = _check_points(points)
+    def detect(self, points: np.ndarray | jax.Array, *, frustum: np.ndarray | None = None) -> FrameResult:
+        """Detections of one cloud; as calling the detector with it."""
+        points = _check_points(np.asarray(points))
         program = self.compile(len(points))
         start = time.perf_counter()
         padded = np.zeros((1, self._bucket(len(points)), 4), np.float32)
@@ -132,6 +127,21 @@ class Detector:
         names = self.config.class_names
         boxes = scene.boxes.to_array()[:n]
         return FrameResult(boxes, scene.score[:n], tuple(names[i] for i in scene.label[:n]), counts, seconds)
+
+    def compile(self, num_points: int) -> jax.stages.Compiled:
+        """The program for clouds of up to so many points, compiled on first use."""
+        bucket = self._bucket(num_points)
+        if bucket not in self._programs:
+            cloud = PointCloud(np.zeros((1, bucket, 4), np.float32), np.zeros(1, np.int32))
+            step = jax.jit(predict, static_argnames="config")
+            self._programs[bucket] = step.lower(self._variables, cloud, self.config, frustum=ANYWHERE[None]).compile()
+        return self._programs[bucket]
+
+    def _bucket(self, num_points: int) -> int:
+        bucket = self.smallest_bucket
+        while bucket < num_points:
+            bucket *= 4
+        return bucket
 
 
 def find_weights(path_or_name: str | os.PathLike[str]) -> Path:
@@ -157,7 +167,7 @@ def _check_points(points: np.ndarray) -> np.ndarray:
         warnings.warn(
             f"{len(points)} intensities of up to {top:g} were divided by 255: the network reads [0, 1].",
             DroppedWarning,
-            stacklevel=4,
+            stacklevel=3,
         )
         points = np.concatenate([points[:, :3], points[:, 3:] / 255], 1)
     return points
@@ -198,4 +208,4 @@ def _warn_of_drops(counts: dict[str, Any], not_finite: int) -> None:
     if counts["candidates"]["dropped"]:
         lost.append(f"{counts['candidates']['dropped']} candidates beyond detection.max_candidates")
     if lost:
-        warnings.warn("Dropped " + "; ".join(lost) + ".", DroppedWarning, stacklevel=4)
+        warnings.warn("Dropped " + "; ".join(lost) + ".", DroppedWarning, stacklevel=3)

@@ -22,6 +22,7 @@ import safetensors.numpy
 from ciassd_jax.config import Config, HeadConfig, car_released
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.formats.torch_file import read_torch_file
+from ciassd_jax.formats.writing import replacing
 from ciassd_jax.model.detector import init_variables
 
 Tensors = Mapping[str, np.ndarray]
@@ -126,10 +127,11 @@ def load_released_weights(path: str | os.PathLike[str]) -> Weights:
 
 
 def save_weights(path: str | os.PathLike[str], variables: Variables, config: Config) -> None:
-    """Write our own file: float32 variables, and the config and class names as metadata."""
+    """Write our own file, whole or not at all: float32 variables, and the config and class names as metadata."""
     flat = {_name(keys): np.asarray(leaf) for keys, leaf in _leaves(variables)}
     metadata = {"format": FORMAT, "config": config.to_json(), "class_names": json.dumps(config.class_names)}
-    safetensors.numpy.save_file(flat, path, metadata=metadata)
+    with replacing(path) as temporary:
+        temporary.write_bytes(safetensors.numpy.save(flat, metadata=metadata))
 
 
 def check_fits(weights: Weights, config: Config, path: str | os.PathLike[str]) -> None:

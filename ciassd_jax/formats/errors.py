@@ -1,4 +1,4 @@
-"""What a file that cannot be used raises."""
+"""What a file that cannot be used raises, and what one that can be used in part warns of."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ Pathlike = str | os.PathLike[str]
 
 class FormatError(ValueError):
     """A file cannot be used; the message is one sentence that names it and the remedy."""
+
+
+class FormatWarning(UserWarning):
+    """A file was read, but lacks something; the message names it and what stands in for it."""
 
 
 def read_bytes(path: Pathlike, limit: int = -1) -> bytes:

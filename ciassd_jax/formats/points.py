@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32
 
-from ciassd_jax.formats.errors import FormatError, Pathlike, read_bytes
+from ciassd_jax.formats.errors import FormatError, FormatWarning, Pathlike, read_bytes
 
 POINT_SUFFIXES = (".bin", ".npy", ".npz", ".pcd")
 
@@ -68,7 +68,7 @@ def _as_points(array: np.ndarray, path: Pathlike) -> Float32[np.ndarray, "N 4"]:
     points = np.zeros((len(array), 4), np.float32)
     columns = min(array.shape[1], 4)
     if columns == 3:
-        warnings.warn(f"{path} has no intensity; 0 is used instead.", stacklevel=4)
+        warnings.warn(f"{path} has no intensity; 0 is used instead.", FormatWarning, stacklevel=4)
     points[:, :columns] = array[:, :columns]
     return points
 

@@ -177,8 +177,9 @@ def _average(boxes: Boxes, weights: Float[Array, "K K"], *, align: bool) -> Boxe
     usable = total != 0
     share = weights / jnp.where(usable, total, 1)[:, None]
     own = boxes.to_array()
-    # Differences from the row's own box are small: the mean loses no digits.
-    offset = own[None] - own[:, None]
+    # Differences from the row's own box are small: the mean loses no digits. A box without weight may be
+    # anything, infinite included.
+    offset = jnp.where((weights != 0)[..., None], own[None] - own[:, None], 0)
     if align:
         turn = offset[..., 6]
         offset = offset.at[..., 6].set(turn - jnp.round(turn / jnp.pi) * jnp.pi)

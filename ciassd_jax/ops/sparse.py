@@ -122,7 +122,7 @@ def _site_indices(sites: Sites, keys: Int[Array, "*n"], wanted: Bool[Array, "*n"
     return jnp.where(wanted & (sites.keys[position] == keys), position, slots)
 
 
-def _column_map(sites: Sites, *, shape: Triple) -> UInt32[Array, "columns words+1"]:
+def _column_map(sites: Sites, *, shape: Triple) -> UInt32[Array, "columns words"]:
     """For every BEV column (y, x): a bit for each active z, in words of 32, and the slot of its lowest site.
 
     With it a site is found in constant time: its slot is the column's first plus the number of set bits below.

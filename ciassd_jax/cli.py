@@ -1,0 +1,228 @@
+"""The program `ciassd`: every sub-command is a thin call of public functions.
+
+Exit codes: 0 good, 1 failed check, 2 bad usage or input (one sentence on stderr says what and the remedy).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from ciassd_jax.config import PRESETS, Config
+from ciassd_jax.formats.errors import FormatError
+
+if TYPE_CHECKING:
+    from ciassd_jax.detector import FrameResult
+    from ciassd_jax.weights import Weights
+
+Preset = Literal["car", "car_released", "car_lite", "three_class", "tiny"]
+
+
+@dataclass(frozen=True)
+class Predict:
+    """Detect boxes in a cloud or a folder of clouds; writes OUT/NAME.json, and KITTI rows with a calibration."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A .bin, .npy, .npz or .pcd file, or a folder of them."""
+    weights: Path
+    """Weights: a file that `ciassd convert` wrote, a released .pth, or the name of bundled ones."""
+    out: Path
+    """Folder for the results."""
+    calib: Path | None = None
+    """Calibration file, or a folder of them; found by itself in a KITTI layout."""
+    image_size: tuple[int, int] | None = None
+    """Width and height of the image in pixels, for cameras that KITTI does not have."""
+    preset: Preset | None = None
+    """Use this preset instead of the config in the weights file; the parameters must fit."""
+    dtype: Literal["float32", "bfloat16"] | None = None
+    """Compute type of the network."""
+    score_threshold: float | None = None
+    """Class probability that a candidate needs (the preset's: 0.3)."""
+
+    def run(self) -> int:
+        from ciassd_jax.detector import Detector
+        from ciassd_jax.predict_files import detect_frames, find_frames, prepare_folder
+
+        frames = find_frames(self.path, calib=self.calib, image_size=self.image_size)
+        weights = _load(self.weights, self.preset)
+        config = _overridden(weights.config, self.dtype, self.score_threshold)
+        out = prepare_folder(self.out)
+        results = detect_frames(Detector(weights.variables, config), frames, out)
+        if len(frames) == 1:
+            with _warnings_as_lines(frames[0].path):
+                for frame, result in results:
+                    print(f"{frame.path}: {_table(result)}")
+        else:
+            self._folder(results, len(frames))
+        print(f"Results are in {out}.")
+        return 0
+
+    def _folder(self, results: Iterator, total: int) -> None:
+        from tqdm.auto import tqdm
+
+        seconds = 0.0
+        with tqdm(total=total, unit="frame") as bar, _warnings_as_lines(self.path):
+            for frame, result in results:
+                best = f"best {result.scores.max():.2f}" if len(result) else "none"
+                bar.write(f"{frame.name}: {len(result)} boxes, {best}, {1e3 * result.seconds:.0f} ms")
+                bar.update()
+                seconds += result.seconds
+        print(f"{total} frames, {1e3 * seconds / total:.0f} ms each on average, without reading and compilation.")
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Convert the authors' published weights to a file of ours, with a report for every tensor."""
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """A released .pth (read without torch; nothing in it is run), or a .safetensors with the released names."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """The file to write: OUT.safetensors."""
+
+    def run(self) -> int:
+        from ciassd_jax.weights import load_released_weights, save_weights
+
+        if self.out.suffix != ".safetensors":
+            raise FormatError(f"{self.out} must end in .safetensors; name the output so.")
+        if self.out.resolve() == self.source.resolve():
+            raise FormatError(f"{self.out} is the input itself; name another output.")
+        weights = load_released_weights(self.source)
+        for row in weights.report:
+            print(f"{row.status:<10}  {row.source:<58}  {row.target:<50}  {row.shape}")
+        save_weights(self.out, weights.variables, weights.config)
+        used = sum(row.status != "counter" for row in weights.report)
+        print(f"Wrote {self.out}: {used} tensors; {len(weights.report) - used} counters were not needed.")
+        return 0
+
+
+@dataclass(frozen=True)
+class Info:
+    """Show a config, its parameters, its arithmetic and the memory of the compiled program."""
+
+    preset: Preset | None = None
+    """A preset by name; `car` where nothing is given."""
+    weights: Path | None = None
+    """Or the config of a weights file."""
+    points: int = 20000
+    """Points per cloud that the program must hold."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        from ciassd_jax import info
+
+        config = _load(self.weights, self.preset).config if self.weights else PRESETS[self.preset or "car"]()
+        facts = {
+            "config": json.loads(config.to_json()),
+            "parameters": info.count_parameters(config),
+            "flops": info.count_flops(config),
+            "memory": info.compiled_memory(config, self.points),
+        }
+        if self.json:
+            print(json.dumps(facts))
+            return 0
+        print(config.to_json())
+        for part, count in facts["parameters"].items():
+            print(f"{part:<10} {count:>12,} parameters  {facts['flops'][part] / 1e9:>8.2f} GFLOP")
+        print("FLOPs are one scene's convolutions with the backbone at full capacity; real scenes fill less.")
+        memory = facts["memory"]
+        sizes = ", ".join(f"{name} {memory[name] / 1e6:.1f} MB" for name in ("arguments", "outputs", "temporaries"))
+        print(f"Compiled for {memory['platform']} and up to {self.points} points: {sizes}.")
+        return 0
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Run the whole pipeline on a synthetic scene, or on your file, and write results and a picture."""
+
+    file: Annotated[Path | None, tyro.conf.Positional] = None
+    """A cloud of your own instead of the synthetic scene."""
+    weights: Path | None = None
+    """Trained weights; without them the demo says that its network is untrained."""
+    out: Path = Path("ciassd_demo")
+    """Folder for the results."""
+
+    def run(self) -> int:
+        from ciassd_jax.demo import run_demo
+
+        with _warnings_as_lines(self.file or "synthetic scene"):
+            weights = _load(self.weights, None) if self.weights else None
+            run_demo(self.file, weights, self.out)
+        return 0
+
+
+Command = (
+    Annotated[Predict, tyro.conf.subcommand("predict")]
+    | Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns the exit code."""
+    command = tyro.cli(Command, prog="ciassd", args=arguments, description="LiDAR 3D object detection in JAX.")  # type: ignore[arg-type]
+    try:
+        return command.run()
+    except (FormatError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def _load(path: Path, preset: str | None) -> Weights:
+    """The weights, with the preset's config in place of their own where one is asked for."""
+    from ciassd_jax.detector import find_weights
+    from ciassd_jax.weights import check_fits, load_weights
+
+    weights = load_weights(find_weights(path))
+    if preset is None:
+        return weights
+    config = PRESETS[preset]()
+    check_fits(weights, config, path)
+    return weights._replace(config=config)
+
+
+def _overridden(config: Config, dtype: Literal["float32", "bfloat16"] | None, threshold: float | None) -> Config:
+    if dtype is not None:
+        config = dataclasses.replace(config, dtype=dtype)
+    if threshold is not None:
+        config = dataclasses.replace(
+            config, detection=dataclasses.replace(config.detection, score_threshold=threshold)
+        )
+    return config
+
+
+def _table(result: FrameResult) -> str:
+    rows = [f"{len(result)} detections in {1e3 * result.seconds:.0f} ms"]
+    if len(result):
+        rows.append("  class       score       x       y       z  length   width  height     yaw")
+    for label, score, box in zip(result.labels, result.scores, result.boxes, strict=True):
+        rows.append(f"  {label:<10} {score:>6.3f} " + " ".join(f"{value:>7.2f}" for value in box))
+    return "\n".join(rows)
+
+
+@contextmanager
+def _warnings_as_lines(source: Path | str) -> Iterator[None]:
+    """Show our own warnings as one line that names the input."""
+    from ciassd_jax.detector import DroppedWarning
+
+    def show(message, category, *rest, **more):  # type: ignore[no-untyped-def]
+        if issubclass(category, DroppedWarning) or category is UserWarning:
+            print(f"warning: {source}: {message}", file=sys.stderr)
+        else:
+            before(message, category, *rest, **more)
+
+    before = warnings.showwarning
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", DroppedWarning)
+        warnings.showwarning = show
+        yield
