@@ -1,6 +1,6 @@
 """LiDAR 3D object detection in JAX: CIA-SSD as pure functions with fixed shapes."""
 
-from ciassd_jax.config import Config, car, car_released, three_class, tiny
+from ciassd_jax.config import Config, car, car_lite, car_released, three_class, tiny
 from ciassd_jax.detector import Detector
 from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import predict
@@ -16,6 +16,7 @@ __all__ = [
     "Detector",
     "PointCloud",
     "car",
+    "car_lite",
     "car_released",
     "init_variables",
     "load_weights",

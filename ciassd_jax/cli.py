@@ -195,9 +195,7 @@ def _overridden(config: Config, dtype: Literal["float32", "bfloat16"] | None, th
     if dtype is not None:
         config = dataclasses.replace(config, dtype=dtype)
     if threshold is not None:
-        config = dataclasses.replace(
-            config, detection=dataclasses.replace(config.detection, score_threshold=threshold)
-        )
+        config = dataclasses.replace(config, detection=dataclasses.replace(config.detection, score_threshold=threshold))
     return config
 
 

@@ -30,7 +30,7 @@ def count_flops(config: Config) -> dict[str, int]:
     """
     params = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))["params"]
     cells = prod(config.bev_shape)
-    counts = {part: 0 for part in PARTS}
+    counts = dict.fromkeys(PARTS, 0)
     for part in PARTS:
         for keys, leaf in jax.tree_util.tree_flatten_with_path(params[part])[0]:
             if keys[-1].key == "kernel":

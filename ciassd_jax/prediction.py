@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,7 @@ from ciassd_jax.config import Config, GridConfig
 from ciassd_jax.model.detector import CIASSD
 from ciassd_jax.ops import boxes as box_ops
 from ciassd_jax.ops.voxelize import voxelize
-from ciassd_jax.types import Array, Counts, Detections, PointCloud, Predictions, SparseVoxels
-
-Variables = Any
+from ciassd_jax.types import Array, Counts, Detections, PointCloud, Predictions, SparseVoxels, Variables
 
 
 class RawPredictions(NamedTuple):

@@ -11,7 +11,7 @@ Frame: LiDAR, x forward, y left, z up, metres. Yaw is counter-clockwise from +x,
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 Array = jax.Array | np.ndarray
+# Flax variables: {"params": ..., "batch_stats": ...}, or a train state that has both.
+Variables = Any
 
 
 class PointCloud(NamedTuple):

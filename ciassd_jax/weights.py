@@ -24,25 +24,16 @@ from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.formats.torch_file import read_torch_file
 from ciassd_jax.formats.writing import replacing
 from ciassd_jax.model.detector import init_variables
+from ciassd_jax.types import Variables
 
 Tensors = Mapping[str, np.ndarray]
-Variables = Any
 FORMAT = "ciassd_jax weights 1"
 
 _SPARSE_LAYERS = [
-    "stage0_0",
-    "stage0_1",
-    "stage1_down",
-    "stage1_0",
-    "stage1_1",
-    "stage2_down",
-    "stage2_0",
-    "stage2_1",
-    "stage2_2",
-    "stage3_down",
-    "stage3_0",
-    "stage3_1",
-    "stage3_2",
+    *("stage0_0", "stage0_1"),
+    *("stage1_down", "stage1_0", "stage1_1"),
+    *("stage2_down", "stage2_0", "stage2_1", "stage2_2"),
+    *("stage3_down", "stage3_0", "stage3_1", "stage3_2"),
     "out",
 ]
 # Our layer, the released convolution and its BatchNorm, below `neck`.

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from ciassd_jax.config import BackboneConfig
 from ciassd_jax.model.layers import Convolution, SparseConvNormRelu
 from ciassd_jax.ops import sparse, sparse_dense
 from ciassd_jax.ops.sparse import Triple
-from ciassd_jax.types import Array, Sites, SparseVoxels
+from ciassd_jax.types import Sites, SparseVoxels
 
 
 class SPConvNet(nn.Module):
@@ -32,7 +33,7 @@ class SPConvNet(nn.Module):
         layer = partial(SparseConvNormRelu, dtype=self.dtype, axis_name=self.axis_name)
         shapes = self.config.stage_shapes(self.shape)
         sites = _sites_of(voxels, self.shape)
-        x = voxels.features.reshape(-1, voxels.features.shape[-1])
+        x = jnp.asarray(voxels.features).reshape(-1, voxels.features.shape[-1])
         kept, dropped = [], []
         for i, stage in enumerate(self.config.stages):
             if i > 0:
@@ -41,7 +42,7 @@ class SPConvNet(nn.Module):
                 x = layer(stage.channels, (3, 3, 3), name=f"stage{i}_down")(x, convolution, _real(sites), train=train)
                 kept.append(sites.count)
                 dropped.append(lost)
-            convolution = _submanifold(sites, shapes[i], self.config.backend) if stage.layers else None
+            convolution = _submanifold(sites, shapes[i], self.config.backend)
             for j in range(stage.layers):
                 x = layer(stage.channels, (3, 3, 3), name=f"stage{i}_{j}")(x, convolution, _real(sites), train=train)
         step = _Strided(shapes[-2], shapes[-1], (3, 1, 1), (2, 1, 1), (0, 0, 0))
@@ -55,7 +56,7 @@ class _Strided:
     """Geometry of one strided convolution."""
 
     def __init__(self, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple) -> None:
-        self.geometry = {"shape": shape, "out_shape": out_shape, "stride": stride, "padding": padding}
+        self.geometry: dict[str, Any] = {"shape": shape, "out_shape": out_shape, "stride": stride, "padding": padding}
         self.kernel = kernel
 
     def plan(self, sites: Sites, capacity: int, backend: str) -> tuple[Sites, Convolution, Int[Array, " B"]]:
@@ -64,7 +65,7 @@ class _Strided:
         find = (sparse if backend == "gather" else sparse_dense).strided_sites
         out_sites, dropped = jax.vmap(partial(find, kernel=kernel, capacity=capacity, **geometry))(sites)
         if backend == "gather":
-            table = jax.vmap(partial(sparse.strided_table, kernel=kernel, **geometry))(sites, out_sites)
+            table = jax.vmap(lambda a, b: sparse.strided_table(a, b, kernel=kernel, **geometry))(sites, out_sites)
             return out_sites, _gather(sparse.flatten_scenes(table)), dropped
         return out_sites, _dense(sites, out_sites, kernel_size=kernel, **geometry), dropped
 
@@ -83,13 +84,13 @@ def _gather(table: sparse.NeighbourTable) -> Convolution:
     return lambda features, kernel: sparse.convolve(features, table, kernel)
 
 
-def _dense(sites: Sites, out_sites: Sites, **geometry: Triple) -> Convolution:
+def _dense(sites: Sites, out_sites: Sites, **geometry: Any) -> Convolution:
     """The dense definition, on rows of all scenes like the gather backend."""
 
     def convolution(features: Array, kernel: Array) -> Array:
         scenes = features.reshape(*sites.keys.shape, -1)
-        one = partial(sparse_dense.convolve, **geometry)
-        result = jax.vmap(lambda f, s, o: one(f, s, o, kernel))(scenes, sites, out_sites)
+        one = lambda f, s, o: sparse_dense.convolve(f, s, o, kernel, **geometry)  # noqa: E731
+        result: Array = jax.vmap(one)(scenes, sites, out_sites)
         return result.reshape(-1, kernel.shape[-1])
 
     return convolution

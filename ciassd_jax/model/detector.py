@@ -7,13 +7,13 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Int
+from jaxtyping import Array, Int
 
 from ciassd_jax.config import Config
 from ciassd_jax.model.backbone import SPConvNet
 from ciassd_jax.model.head import MultiTaskHead
 from ciassd_jax.model.neck import SSFA
-from ciassd_jax.types import Array, Predictions, SparseVoxels
+from ciassd_jax.types import Predictions, SparseVoxels
 
 
 class CIASSD(nn.Module):

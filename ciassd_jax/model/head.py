@@ -5,11 +5,11 @@ from __future__ import annotations
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ciassd_jax.config import HeadConfig
 from ciassd_jax.model.layers import uniform_by_fan_in
-from ciassd_jax.types import Array, Predictions
+from ciassd_jax.types import Predictions
 
 
 class Branch(nn.Module):

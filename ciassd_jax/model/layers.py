@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Bool, Float
-
-from ciassd_jax.types import Array
+from jaxtyping import Array, Bool, Float
 
 Initializer = Callable[..., Array]
-Convolution = Callable[[Array, Array], Array]
+Convolution = Callable[..., Any]
 
 EPSILON = 1e-3
 MOMENTUM = 0.99

@@ -7,11 +7,10 @@ from functools import partial
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ciassd_jax.config import NeckConfig
 from ciassd_jax.model.layers import ConvNormRelu, UpsampleNormRelu
-from ciassd_jax.types import Array
 
 
 class SSFA(nn.Module):

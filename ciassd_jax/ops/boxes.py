@@ -84,4 +84,4 @@ def inside_range(
     shape = (1,) * (boxes.center.ndim - 1) + (3,)
     low = jnp.array(minimum, boxes.center.dtype).reshape(shape)
     high = jnp.array(maximum, boxes.center.dtype).reshape(shape)
-    return ((boxes.center >= low) & (boxes.center <= high)).all(-1)
+    return jnp.all((boxes.center >= low) & (boxes.center <= high), -1)

@@ -38,7 +38,8 @@ def inside_planes(points: Float[Array, "*n 3"], planes: Float[Array, "k 4"]) -> 
     """Whether each point is strictly inside every half-space; points that are not finite are outside."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     # Sums, not a matrix product: accelerators would round that to TF32.
-    return functools.reduce(operator.and_, [a * x + b * y + c * z + d > 0 for a, b, c, d in planes])
+    inside = functools.reduce(operator.and_, [a * x + b * y + c * z + d > 0 for a, b, c, d in planes])
+    return np.asarray(inside) if isinstance(inside, np.bool) else inside
 
 
 def project(

@@ -86,7 +86,7 @@ def _clip(
         on_line = parallel & (s == line)
         edge[2] = edge[2] * xp.where(on_line, 0.5, xp.where(parallel & (side > 0), 0.0, 1.0))
         weight = weight * xp.where(on_line, 0.5, 1.0)
-    outside = parallel & (abs(s) > half)
+    outside = parallel & ((s > half) | (s < -half))
     low = xp.where(parallel, 0, xp.minimum(*crossings))
     high = xp.where(parallel, 1, xp.maximum(*crossings))
     return low, high, weight * xp.where(outside, 0.0, 1.0)

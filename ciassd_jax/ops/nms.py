@@ -59,12 +59,12 @@ def greedy_keep(overlaps: Bool[Array, "K K"], eligible: Bool[Array, " K"]) -> Bo
     slots = jnp.arange(eligible.shape[0], dtype=jnp.int32)
     suppresses = overlaps & (slots[:, None] < slots[None])
 
-    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         keep, _ = state
-        updated = eligible & ~(suppresses & keep[:, None]).any(0)
+        updated = jnp.asarray(eligible) & ~(suppresses & keep[:, None]).any(0)
         return updated, (updated != keep).any()
 
-    return lax.while_loop(lambda state: state[1], step, (eligible, jnp.array(True)))[0]
+    return lax.while_loop(lambda state: state[1], step, (jnp.asarray(eligible), jnp.array(True)))[0]
 
 
 def rotated_nms(candidates: Candidates, *, overlap: float, limit: int | None = None) -> Clusters:
@@ -182,6 +182,6 @@ def _average(boxes: Boxes, weights: Float[Array, "K K"], *, align: bool) -> Boxe
     offset = jnp.where((weights != 0)[..., None], own[None] - own[:, None], 0)
     if align:
         turn = offset[..., 6]
-        offset = offset.at[..., 6].set(turn - jnp.round(turn / jnp.pi) * jnp.pi)
+        offset = jnp.asarray(offset).at[..., 6].set(turn - jnp.round(turn / jnp.pi) * jnp.pi)
     mean = own + jnp.where(usable[:, None], (share[..., None] * offset).sum(1), 0)
     return Boxes.from_array(mean)

@@ -156,7 +156,7 @@ def _window_indices(
     y, x = corner[:, 1:2] + offset_y[None], corner[:, 2:] + offset_x[None]
     inside = real[:, None] & (y >= 0) & (y < height) & (x >= 0) & (x < width)
     columns = _column_map(sites, shape=shape)
-    entry = columns.at[jnp.where(inside, y * width + x, 0)].get(mode="promise_in_bounds")
+    entry = jnp.asarray(columns).at[jnp.where(inside, y * width + x, 0)].get(mode="promise_in_bounds")
     words, start = entry[..., :-1], entry[..., -1].astype(jnp.int32)
     found = []
     for dz in range(kernel[0]):
@@ -242,7 +242,7 @@ def _blocks(index: Int[Array, "V K"], absent: int, rows: int) -> tuple[Array, Ar
 def _gathered(features: Float[Array, "U1 C"], index: Int[Array, "V K"], start: Array, rows: int) -> Array:
     """The inputs of one block of rows, [rows, K * C]; the last feature row is zero and stands for 'none'."""
     block = lax.dynamic_slice_in_dim(index, start, rows)
-    return features.at[block].get(mode="promise_in_bounds").reshape(rows, -1)
+    return jnp.asarray(features).at[block].get(mode="promise_in_bounds").reshape(rows, -1)
 
 
 @_per_platform

@@ -50,8 +50,8 @@ def convolve(
     real = (sites.keys != NO_SITE)[:, None]
     grid = to_dense(jnp.where(real, features, 0), sites, shape=shape)
     dense = lax.conv_general_dilated(
-        grid[None],
-        kernel.reshape(*kernel_size, *kernel.shape[1:]),
+        jnp.asarray(grid)[None],
+        jnp.asarray(kernel).reshape(*kernel_size, *kernel.shape[1:]),
         stride,
         [(p, p) for p in padding],
         dimension_numbers=("NDHWC", "DHWIO", "NDHWC"),

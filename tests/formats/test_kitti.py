@@ -141,8 +141,7 @@ def test_rows_are_read_and_written(tmp_path):
     row = ObjectRow("Cyclist", 0.5, 3, -1.5, (1, 2, 3, 4), (1.6, 0.5, 1.7), (-5, 1.6, 15.25), 0.1)
     assert read_rows(path) == [row, row._replace(score=0.25)]
     assert format_row(row) == (
-        "Cyclist 0.5000 3 -1.5000 1.0000 2.0000 3.0000 4.0000 "
-        "1.6000 0.5000 1.7000 -5.0000 1.6000 15.2500 0.1000"
+        "Cyclist 0.5000 3 -1.5000 1.0000 2.0000 3.0000 4.0000 1.6000 0.5000 1.7000 -5.0000 1.6000 15.2500 0.1000"
     )
     assert format_row(row._replace(score=0.25)) == format_row(row) + " 0.2500"
     write_rows(path, [row, row._replace(score=0.25)])

@@ -118,9 +118,7 @@ def test_no_points_are_points_where_a_header_says_so(tmp_path):
 def test_values_are_not_cleaned(tmp_path):
     array = np.array([[np.nan, np.inf, 1e300, 255.0]])
     (tmp_path / "a.npy").write_bytes(saved(np.save, array))
-    np.testing.assert_array_equal(
-        read_points(tmp_path / "a.npy"), np.float32([[np.nan, np.inf, np.inf, 255]])
-    )
+    np.testing.assert_array_equal(read_points(tmp_path / "a.npy"), np.float32([[np.nan, np.inf, np.inf, 255]]))
 
 
 BAD = {

@@ -65,9 +65,7 @@ def test_jax_agrees_under_jit_and_for_any_leading_axes():
     arrays = jnp.asarray(points, jnp.float32), jnp.asarray(planes, jnp.float32)
     np.testing.assert_array_equal(jax.jit(inside_planes)(*arrays), expected)
     np.testing.assert_array_equal(inside_planes(arrays[0], planes), expected)
-    np.testing.assert_array_equal(
-        inside_planes(arrays[0].reshape(2, 256, 3), arrays[1]), expected.reshape(2, 256)
-    )
+    np.testing.assert_array_equal(inside_planes(arrays[0].reshape(2, 256, 3), arrays[1]), expected.reshape(2, 256))
     batched = jax.vmap(inside_planes)(arrays[0].reshape(2, 256, 3), jnp.stack([arrays[1]] * 2))
     np.testing.assert_array_equal(batched, expected.reshape(2, 256))
     assert inside_planes(points[0], planes).shape == ()
