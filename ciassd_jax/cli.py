@@ -18,13 +18,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ciassd_jax.config import PRESETS, Config
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import FormatError, FormatWarning
 
 if TYPE_CHECKING:
-    from ciassd_jax.detector import FrameResult
+    from ciassd_jax.detector import Detector, FrameResult
+    from ciassd_jax.predict_files import Frame
     from ciassd_jax.weights import Weights
 
 Preset = Literal["car", "car_released", "car_lite", "three_class", "tiny"]
+
+
+class UsageError(ValueError):
+    """An option cannot be used; the message is one sentence that says what would be valid."""
 
 
 @dataclass(frozen=True)
@@ -50,33 +55,43 @@ class Predict:
 
     def run(self) -> int:
         from ciassd_jax.detector import Detector
-        from ciassd_jax.predict_files import detect_frames, find_frames, prepare_folder
+        from ciassd_jax.formats.writing import check_folder
+        from ciassd_jax.predict_files import find_frames
 
         frames = find_frames(self.path, calib=self.calib, image_size=self.image_size)
         weights = _load(self.weights, self.preset)
         config = _overridden(weights.config, self.dtype, self.score_threshold)
-        out = prepare_folder(self.out)
-        results = detect_frames(Detector(weights.variables, config), frames, out)
-        if len(frames) == 1:
-            with _warnings_as_lines(frames[0].path):
-                for frame, result in results:
-                    print(f"{frame.path}: {_table(result)}")
+        check_folder(self.out)
+        detector = Detector(weights.variables, config)
+        if self.path.is_dir():
+            self._folder(detector, frames)
         else:
-            self._folder(results, len(frames))
-        print(f"Results are in {out}.")
+            result, written = self._frame(detector, frames[0])
+            print(f"{self.path}: {_table(result)}")
+            print(f"Wrote {' and '.join(map(str, written))}.")
         return 0
 
-    def _folder(self, results: Iterator, total: int) -> None:
+    def _frame(self, detector: Detector, frame: Frame) -> tuple[FrameResult, list[Path]]:
+        from ciassd_jax.predict_files import detect_frame, write_frame
+
+        with _warnings_as_lines(frame.cloud):
+            result = detect_frame(detector, frame)
+            return result, write_frame(frame, result, self.out)
+
+    def _folder(self, detector: Detector, frames: list[Frame]) -> None:
         from tqdm.auto import tqdm
 
-        seconds = 0.0
-        with tqdm(total=total, unit="frame") as bar, _warnings_as_lines(self.path):
-            for frame, result in results:
+        boxes, seconds = 0, 0.0
+        with tqdm(frames, unit="frame") as bar:
+            for frame in bar:
+                result, _ = self._frame(detector, frame)
                 best = f"best {result.scores.max():.2f}" if len(result) else "none"
-                bar.write(f"{frame.name}: {len(result)} boxes, {best}, {1e3 * result.seconds:.0f} ms")
-                bar.update()
-                seconds += result.seconds
-        print(f"{total} frames, {1e3 * seconds / total:.0f} ms each on average, without reading and compilation.")
+                bar.write(f"{frame.cloud.name}: {len(result)} boxes, {best}, {result.seconds:.3f} s")
+                boxes, seconds = boxes + len(result), seconds + result.seconds
+        print(
+            f"{len(frames)} frames, {boxes} boxes, {seconds / len(frames):.3f} s a frame without reading and "
+            f"compilation; results are in {self.out}."
+        )
 
 
 @dataclass(frozen=True)
@@ -135,7 +150,10 @@ class Info:
             print(f"{part:<10} {count:>12,} parameters  {facts['flops'][part] / 1e9:>8.2f} GFLOP")
         print("FLOPs are one scene's convolutions with the backbone at full capacity; real scenes fill less.")
         memory = facts["memory"]
-        sizes = ", ".join(f"{name} {memory[name] / 1e6:.1f} MB" for name in ("arguments", "outputs", "temporaries"))
+        sizes = ", ".join(
+            f"{name} unknown" if memory[name] is None else f"{name} {memory[name] / 1e6:.1f} MB"
+            for name in ("arguments", "outputs", "temporaries")
+        )
         print(f"Compiled for {memory['platform']} and up to {self.points} points: {sizes}.")
         return 0
 
@@ -170,10 +188,10 @@ Command = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
-    command = tyro.cli(Command, prog="ciassd", args=arguments, description="LiDAR 3D object detection in JAX.")  # type: ignore[arg-type]
+    command = tyro.cli(Command, prog="ciassd", args=arguments, description="LiDAR 3D object detection in JAX.")
     try:
         return command.run()
-    except (FormatError, ValueError) as error:
+    except (FormatError, UsageError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 
@@ -195,7 +213,11 @@ def _overridden(config: Config, dtype: Literal["float32", "bfloat16"] | None, th
     if dtype is not None:
         config = dataclasses.replace(config, dtype=dtype)
     if threshold is not None:
-        config = dataclasses.replace(config, detection=dataclasses.replace(config.detection, score_threshold=threshold))
+        try:
+            detection = dataclasses.replace(config.detection, score_threshold=threshold)
+        except ValueError as error:
+            raise UsageError(str(error)) from error
+        config = dataclasses.replace(config, detection=detection)
     return config
 
 
@@ -210,17 +232,21 @@ def _table(result: FrameResult) -> str:
 
 @contextmanager
 def _warnings_as_lines(source: Path | str) -> Iterator[None]:
-    """Show our own warnings as one line that names the input."""
+    """Show our own warnings as one line that names the input; leave all others as they are."""
+    from tqdm.auto import tqdm
+
     from ciassd_jax.detector import DroppedWarning
 
     def show(message, category, *rest, **more):  # type: ignore[no-untyped-def]
-        if issubclass(category, DroppedWarning) or category is UserWarning:
-            print(f"warning: {source}: {message}", file=sys.stderr)
+        if issubclass(category, DroppedWarning | FormatWarning):
+            named = message if issubclass(category, FormatWarning) else f"{source}: {message}"
+            tqdm.write(f"warning: {named}", file=sys.stderr)
         else:
             before(message, category, *rest, **more)
 
     before = warnings.showwarning
     with warnings.catch_warnings():
         warnings.simplefilter("always", DroppedWarning)
+        warnings.simplefilter("always", FormatWarning)
         warnings.showwarning = show
         yield

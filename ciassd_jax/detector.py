@@ -16,8 +16,8 @@ import numpy as np
 from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.prediction import predict, variables_of
-from ciassd_jax.types import Counts, PointCloud
-from ciassd_jax.weights import Variables, load_weights
+from ciassd_jax.types import Counts, PointCloud, Variables
+from ciassd_jax.weights import load_weights
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,128 +1,158 @@
-"""Detections for files: which clouds, which calibration, and what is written for each frame."""
+"""Clouds in files to results in files: which clouds, with which calibration, written where."""
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterable, Iterator
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from ciassd_jax.detector import Detector, FrameResult
-from ciassd_jax.formats import kitti
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import FormatError, FormatWarning, Pathlike, read_bytes
+from ciassd_jax.formats.kitti import (
+    Calibration,
+    boxes_to_rows,
+    image_size_for,
+    lidar_to_image,
+    read_calibration,
+    read_png_size,
+    write_rows,
+)
 from ciassd_jax.formats.points import POINT_SUFFIXES, read_points
+from ciassd_jax.formats.writing import replacing
 from ciassd_jax.ops.camera import frustum_planes
 from ciassd_jax.types import Boxes
 
 
 class Camera(NamedTuple):
-    """A frame's calibration and its image's size (width, height) in pixels."""
+    """The camera of a frame: its calibration and the (width, height) of its image in pixels."""
 
-    calibration: kitti.Calibration
+    calibration: Calibration
     image_size: tuple[int, int]
 
 
 class Frame(NamedTuple):
-    """One cloud to detect in: the name of its results, its file, and its camera where one is known."""
+    """A file of points, and its camera where that is known."""
 
-    name: str
-    path: Path
+    cloud: Path
     camera: Camera | None
 
 
-def find_frames(path: Path, *, calib: Path | None = None, image_size: tuple[int, int] | None = None) -> list[Frame]:
-    """The cloud at `path`, or those in that folder by name, with their cameras; checks every file before any work.
+def find_frames(
+    path: Pathlike, *, calib: Pathlike | None = None, image_size: tuple[int, int] | None = None
+) -> list[Frame]:
+    """The cloud at `path`, or the clouds in that folder by name, each with its camera.
 
-    `calib` is one calibration for all or a folder of them; without it, `X/calib/NAME.txt` beside `X/velodyne*/NAME`
-    is taken where it exists. Raises FormatError.
+    `calib` is a calibration file for all clouds or a folder with one for each; without it, `X/calib/NAME.txt` serves
+    `X/velodyne*/NAME.bin` where it is there. The size of the image is as given, else that of
+    `X/image_2/NAME.png`, else KITTI's for the focal length. Raises FormatError for what could not be predicted,
+    as far as that shows without reading everything.
     """
-    if path.is_dir():
-        clouds = sorted(p for p in path.iterdir() if p.suffix.lower() in POINT_SUFFIXES)
-        if not clouds:
-            raise FormatError(f"{path} holds no cloud; name a folder with files of {', '.join(POINT_SUFFIXES)}.")
-    else:
-        clouds = [path]
-    seen: dict[str, Path] = {}
+    clouds = _find_clouds(Path(path))
     for cloud in clouds:
-        _check_cloud(cloud)
-        if cloud.stem in seen:
-            raise FormatError(f"{seen[cloud.stem]} and {cloud} would write the same results; rename one of them.")
-        seen[cloud.stem] = cloud
-    return [Frame(cloud.stem, cloud, _camera_of(cloud, calib, image_size)) for cloud in clouds]
+        _check_cloud(cloud, whole=len(clouds) == 1)
+    return [Frame(cloud, _find_camera(cloud, calib, image_size)) for cloud in clouds]
 
 
-def detect_frames(detector: Detector, frames: Iterable[Frame], out: Path) -> Iterator[tuple[Frame, FrameResult]]:
-    """Detect in each frame and write `OUT/NAME.json`, and with a camera the KITTI rows `OUT/NAME.txt`."""
-    for frame in frames:
-        points = read_points(frame.path)
-        planes = None
-        if frame.camera is not None:
-            width, height = frame.camera.image_size
-            planes = frustum_planes(kitti.lidar_to_image(frame.camera.calibration), width=width, height=height)
-        result = detector.detect(points, frustum=planes)
-        write_atomically(out / f"{frame.name}.json", json.dumps(result.to_dict()))
-        if frame.camera is not None:
-            write_atomically(out / f"{frame.name}.txt", kitti_text(result, frame.camera))
-        yield frame, result
+def detect_frame(detector: Detector, frame: Frame) -> FrameResult:
+    """Read the points of a frame and detect; with a camera, only boxes in its view."""
+    points = read_points(frame.cloud)
+    if frame.camera is None:
+        return detector.detect(points)
+    width, height = frame.camera.image_size
+    planes = frustum_planes(lidar_to_image(frame.camera.calibration), width=width, height=height)
+    return detector.detect(points, frustum=planes)
 
 
-def kitti_text(result: FrameResult, camera: Camera) -> str:
-    """The result's boxes that are seen in the image as KITTI rows, best score first."""
-    boxes = Boxes.from_array(result.boxes.astype(np.float64))
-    rows, _ = kitti.boxes_to_rows(boxes, result.scores, result.labels, camera.calibration, camera.image_size)
-    return "".join(kitti.format_row(row) + "\n" for row in rows)
+def write_frame(frame: Frame, result: FrameResult, folder: Pathlike) -> list[Path]:
+    """Write `folder/NAME.json` and, with a camera, KITTI's rows as `folder/NAME.txt`; the paths of what was written.
 
-
-def prepare_folder(out: Path) -> Path:
-    """Make the output folder and prove that it can be written; raises FormatError."""
-    probe = out / ".write_test"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise FormatError(f"{out} cannot be written ({error.strerror}); choose another --out.") from error
-    return out
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    draft = path.with_name(f".{path.name}.part")
-    try:
-        draft.write_text(text)
-        os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
-
-
-def _check_cloud(cloud: Path) -> None:
-    if cloud.suffix.lower() not in POINT_SUFFIXES or not cloud.is_file():
-        read_points(cloud)  # Its sentence says what is wrong.
-    size = cloud.stat().st_size
-    if size == 0 or (cloud.suffix.lower() == ".bin" and size % 16):
-        read_points(cloud)
-
-
-def _camera_of(cloud: Path, calib: Path | None, image_size: tuple[int, int] | None) -> Camera | None:
-    root = cloud.resolve().parent.parent
-    if calib is None:
-        beside = root / "calib" / f"{cloud.stem}.txt"
-        if not (cloud.resolve().parent.name.startswith("velodyne") and beside.is_file()):
-            return None
-        calib = beside
-    elif calib.is_dir():
-        calib = calib / f"{cloud.stem}.txt"
-    calibration = kitti.read_calibration(calib)
-    image = root / "image_2" / f"{cloud.stem}.png"
-    if image_size is None and image.is_file():
-        image_size = kitti.read_png_size(image)
-    image_size = image_size or kitti.image_size_for(calibration)
-    if image_size is None:
-        raise FormatError(
-            f"{calib} is of no known camera (its focal length is {calibration.projection[0, 0]:g}); "
-            "give the image's size with --image-size WIDTH HEIGHT."
+    Each file appears whole or not at all. Raises FormatError where that fails.
+    """
+    written = [write_json(Path(folder) / f"{frame.cloud.stem}.json", result)]
+    if frame.camera is not None:
+        rows, _ = boxes_to_rows(
+            Boxes.from_array(result.boxes),
+            result.scores,
+            result.labels,
+            frame.camera.calibration,
+            frame.camera.image_size,
         )
-    return Camera(calibration, image_size)
+        written.append(Path(folder) / f"{frame.cloud.stem}.txt")
+        with replacing(written[-1]) as temporary:
+            write_rows(temporary, rows)
+    return written
+
+
+def write_json(path: Path, result: FrameResult) -> Path:
+    """Write one result as JSON, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(result.to_dict()) + "\n", encoding="utf-8")
+    return path
+
+
+def _find_clouds(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    clouds = sorted(p for p in path.iterdir() if p.suffix.lower() in POINT_SUFFIXES)
+    if not clouds:
+        raise FormatError(f"{path} holds no point cloud; give a folder of {', '.join(POINT_SUFFIXES)} files.")
+    _check_distinct(clouds)
+    return clouds
+
+
+def _check_distinct(clouds: Sequence[Path]) -> None:
+    """Results are named by the stem, so no two clouds may share one."""
+    by_stem: dict[str, Path] = {}
+    for cloud in clouds:
+        other = by_stem.setdefault(cloud.stem, cloud)
+        if other is not cloud:
+            raise FormatError(f"{other} and {cloud} would both be written as {cloud.stem}.json; rename one of them.")
+
+
+def _check_cloud(cloud: Path, *, whole: bool) -> None:
+    """Raise FormatError for a cloud that cannot be read: by its name and size alone unless `whole`."""
+    read_bytes(cloud, 0)
+    size, suffix = cloud.stat().st_size, cloud.suffix.lower()
+    if whole or not size or suffix not in POINT_SUFFIXES or (suffix == ".bin" and size % 16):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FormatWarning)
+            read_points(cloud)
+
+
+def _find_camera(cloud: Path, given: Pathlike | None, image_size: tuple[int, int] | None) -> Camera | None:
+    path = _find_calibration(cloud, given)
+    if path is None:
+        return None
+    calibration = read_calibration(path)
+    image = _beside(cloud, "image_2", ".png")
+    if image_size is None and image is not None:
+        image_size = read_png_size(image)
+    size = image_size or image_size_for(calibration)
+    if size is None:
+        raise FormatError(
+            f"{path} has a focal length of {calibration.projection[0, 0]:g} pixels, which is none of KITTI's, so the "
+            "image could be of any size; give it with --image-size WIDTH HEIGHT."
+        )
+    return Camera(calibration, size)
+
+
+def _find_calibration(cloud: Path, given: Pathlike | None) -> Path | None:
+    if given is None:
+        return _beside(cloud, "calib", ".txt")
+    path = Path(given)
+    if not path.is_dir():
+        return path
+    path = path / f"{cloud.stem}.txt"
+    if not path.is_file():
+        raise FormatError(f"{path} does not exist, so {cloud} has no calibration; add it, or leave out --calib.")
+    return path
+
+
+def _beside(cloud: Path, folder: str, suffix: str) -> Path | None:
+    """The file of the same frame in another folder of a KITTI layout, where it is there."""
+    # Absolute, as the cloud may be named from inside its folder.
+    velodyne = cloud.absolute().parent
+    path = velodyne.parent / folder / f"{cloud.stem}{suffix}"
+    return path if velodyne.name.startswith("velodyne") and path.is_file() else None

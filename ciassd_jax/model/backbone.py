@@ -90,8 +90,8 @@ def _dense(sites: Sites, out_sites: Sites, **geometry: Any) -> Convolution:
     def convolution(features: Array, kernel: Array) -> Array:
         scenes = features.reshape(*sites.keys.shape, -1)
         one = lambda f, s, o: sparse_dense.convolve(f, s, o, kernel, **geometry)  # noqa: E731
-        result: Array = jax.vmap(one)(scenes, sites, out_sites)
-        return result.reshape(-1, kernel.shape[-1])
+        result = jax.vmap(one)(scenes, sites, out_sites)
+        return jnp.asarray(result).reshape(-1, kernel.shape[-1])
 
     return convolution
 
@@ -107,6 +107,6 @@ def _real(sites: Sites) -> Array:
 
 def _fold_height(features: Float[Array, "B V C"], sites: Sites, shape: Triple) -> Float[Array, "B H W C2"]:
     """Dense BEV map with channel c * Z + z, as a (C, Z, H, W) tensor folds in the released code."""
-    grid = jax.vmap(partial(sparse.to_dense, shape=shape))(features, sites)
+    grid = jnp.asarray(jax.vmap(partial(sparse.to_dense, shape=shape))(features, sites))
     depth, height, width = shape
     return grid.transpose(0, 2, 3, 4, 1).reshape(-1, height, width, features.shape[-1] * depth)

@@ -1,62 +1,135 @@
-"""A bird's-eye view as a matplotlib figure: no pyplot, no global state, no display."""
+"""A picture of a scene from above, drawn with matplotlib's objects: no window, no global state."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
-from ciassd_jax.formats.errors import FormatError
-
-if TYPE_CHECKING:
+try:
     from matplotlib.axes import Axes
+    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("Pictures need matplotlib; get it with `pip install 'ciassd_jax[viz]'`.") from error
 
-TRUTH, PREDICTION = "#d62728", "#2ca02c"
+TRUTH, FOUND = "#d62728", "#13a538"
+# Heights in metres that the colours span: from the ground below the sensor to the roofs of cars and vans.
+HEIGHTS = (-2.0, 1.0)
 
 
 def plot_bev(
-    points: np.ndarray,
+    points: Float[np.ndarray, "N columns"],
+    boxes: Float[np.ndarray, "D 7"] | None = None,
+    truth: Float[np.ndarray, "G 7"] | None = None,
+    scores: Float[np.ndarray, " D"] | None = None,
+    labels: Sequence[str] | None = None,
     *,
-    boxes: np.ndarray | None = None,
-    scores: np.ndarray | None = None,
-    truth: np.ndarray | None = None,
-    title: str = "",
+    x_limits: tuple[float, float] | None = None,
+    y_limits: tuple[float, float] | None = None,
+    title: str | None = None,
 ) -> Figure:
-    """Points [N, >=3] by height, truth [M, 7] in red and predicted boxes [D, 7] with score and heading in green.
+    """Points coloured by height, ground truth in red, detections in green with score and heading.
 
-    Boxes are x, y, z, length, width, height, yaw; all in metres in the LiDAR frame. The view is that of the points.
+    `points` hold x, y, z (metres) first; boxes are x, y, z, length, width, height, yaw. Without limits the picture
+    holds every point and box of the front half. Save it with `figure.savefig(path)`.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise FormatError("Pictures need matplotlib; install it with `pip install 'ciassd_jax[viz]'`.") from error
-    figure = Figure(figsize=(9, 8), layout="constrained")
+    boxes, truth = _boxes(boxes), _boxes(truth)
+    visible = points[np.isfinite(points[:, :3]).all(1)]
+    figure = Figure(figsize=(9.6, 8.0), dpi=150, layout="constrained")
     axes = figure.add_subplot()
-    points = points[np.isfinite(points).all(1)]
-    shown = axes.scatter(
-        points[:, 0], points[:, 1], c=points[:, 2].clip(-2.5, 1), s=0.6, cmap="viridis", linewidths=0, rasterized=True
+    axes.set_facecolor("#f7f7f4")
+    # The highest points last: roofs and walls over the ground.
+    visible = visible[np.argsort(visible[:, 2], kind="stable")]
+    dots = axes.scatter(
+        visible[:, 0], visible[:, 1], c=visible[:, 2], s=1.2, lw=0, cmap="viridis", vmin=HEIGHTS[0], vmax=HEIGHTS[1]
     )
-    figure.colorbar(shown, label="height (m)", shrink=0.6)
-    if truth is not None:
-        _draw(axes, truth, TRUTH, "ground truth", None)
-    if boxes is not None:
-        _draw(axes, boxes, PREDICTION, "detections", scores)
-    axes.set(xlabel="x forward (m)", ylabel="y left (m)", title=title, aspect="equal")
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper right")
-    axes.margins(0.02)
+    dots.set_rasterized(True)
+    bar = figure.colorbar(dots, ax=axes, shrink=0.6, pad=0.015, extend="both")
+    bar.set_label("height z (m)")
+    _draw_boxes(axes, truth, TRUTH, zorder=3)
+    _draw_boxes(axes, boxes, FOUND, zorder=4)
+    texts = _captions(len(boxes), scores, labels)
+    for box, text in zip(boxes, texts, strict=True):
+        _caption(axes, box, text)
+    _dress(axes, x_limits or _span(visible, boxes, truth, 0), y_limits or _span(visible, boxes, truth, 1))
+    _legend(axes, len(boxes), len(truth))
+    axes.set_title(title or "", loc="left")
     return figure
 
 
-def _draw(axes: Axes, boxes: np.ndarray, colour: str, label: str, scores: np.ndarray | None) -> None:
-    """Footprints, each with a line from its centre to its front."""
-    for i, (x, y, _, length, width, _, yaw) in enumerate(boxes):
-        forward = np.array([np.cos(yaw), np.sin(yaw)]) * length / 2
-        left = np.array([-np.sin(yaw), np.cos(yaw)]) * width / 2
-        centre = np.array([x, y])
-        corners = np.stack([forward + left, forward - left, -forward - left, -forward + left, forward + left]) + centre
-        axes.plot(*corners.T, color=colour, linewidth=1.3, label=label if i == 0 else None)
-        axes.plot(*np.stack([centre, centre + forward]).T, color=colour, linewidth=1.3)
-        if scores is not None:
-            axes.annotate(f"{scores[i]:.2f}", centre + left * 1.4, color=colour, fontsize=7, ha="center")
+def _boxes(boxes: np.ndarray | None) -> np.ndarray:
+    return np.zeros((0, 7)) if boxes is None else np.asarray(boxes, np.float64)
+
+
+def _footprints(boxes: Float[np.ndarray, "D 7"]) -> Float[np.ndarray, "D 5 2"]:
+    """The closed outline of each box on the ground."""
+    corners = np.array([(0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5), (0.5, 0.5)])
+    return _to_scene(boxes, corners[None] * boxes[:, None, 3:5])
+
+
+def _to_scene(boxes: Float[np.ndarray, "D 7"], offsets: Float[np.ndarray, "D n 2"]) -> Float[np.ndarray, "D n 2"]:
+    """Offsets along and across each box as positions (x, y)."""
+    cos, sin = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
+    along, across = offsets[..., 0], offsets[..., 1]
+    return boxes[:, None, :2] + np.stack([along * cos - across * sin, along * sin + across * cos], -1)
+
+
+def _draw_boxes(axes: Axes, boxes: Float[np.ndarray, "D 7"], color: str, zorder: int) -> None:
+    """Outlines, and a line from each centre through the front."""
+    ahead = np.stack([boxes[:, 3] / 2 + 1.0, np.zeros(len(boxes))], -1)
+    heading = _to_scene(boxes, np.stack([np.zeros_like(ahead), ahead], 1))
+    for lines in (_footprints(boxes), heading):
+        axes.add_collection(LineCollection(list(lines), colors=color, linewidths=1.6, zorder=zorder))
+
+
+def _captions(count: int, scores: np.ndarray | None, labels: Sequence[str] | None) -> list[str]:
+    """Class and score of each box; the class only where there are several."""
+    several = labels is not None and len(set(labels)) > 1
+    parts = [list(labels or []) if several else [], [] if scores is None else [f"{score:.2f}" for score in scores]]
+    return [" ".join(part[i] for part in parts if part) for i in range(count)]
+
+
+def _caption(axes: Axes, box: Float[np.ndarray, " 7"], text: str) -> None:
+    if not text:
+        return
+    top = _footprints(box[None])[0][:, 1].max()
+    box_style = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+    axes.annotate(
+        text,
+        (box[0], top),
+        xytext=(0, 3),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        color="#0a6b22",
+        fontsize=8,
+        bbox=box_style,
+        annotation_clip=True,
+        zorder=5,
+    )
+
+
+def _span(points: np.ndarray, boxes: np.ndarray, truth: np.ndarray, axis: int) -> tuple[float, float]:
+    """Limits that hold everything ahead of the sensor and the sensor itself, with a margin."""
+    ahead = points[points[:, 0] >= 0]
+    values = np.concatenate([[0.0], ahead[:, axis], *(_footprints(b)[..., axis].ravel() for b in (boxes, truth))])
+    return float(values.min()) - 2, float(values.max()) + 2
+
+
+def _dress(axes: Axes, x_limits: tuple[float, float], y_limits: tuple[float, float]) -> None:
+    """Metres of equal length along both axes, a light grid and the sensor's place."""
+    axes.set(xlim=x_limits, ylim=y_limits, aspect="equal", xlabel="x forward (m)", ylabel="y left (m)")
+    axes.grid(color="#d9d9d4", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.plot(0, 0, marker=">", markersize=9, color="black", zorder=6, clip_on=True)
+
+
+def _legend(axes: Axes, found: int, truth: int) -> None:
+    handles = [Line2D([], [], color="black", marker=">", linestyle="none", label="sensor")]
+    handles += [Line2D([], [], color=TRUTH, linewidth=1.6, label=f"ground truth ({truth})")] * bool(truth)
+    handles += [Line2D([], [], color=FOUND, linewidth=1.6, label=f"detected ({found})")]
+    axes.legend(handles=handles, loc="upper right", framealpha=0.9, fontsize=9)
