@@ -30,19 +30,21 @@ class GridConfig:
 
     def __post_init__(self) -> None:
         for axis, low, high, size in zip("xyz", self.minimum, self.maximum, self.voxel_size, strict=True):
-            if not (size > 0 and high > low):
+            if not (size > 0 and 0 < high - low < math.inf):
                 raise ValueError(
-                    f"grid.{axis}: range {low}..{high} with voxel size {size} is empty; "
-                    "the maximum must exceed the minimum and the voxel size be positive."
+                    f"grid.{axis}: range {low}..{high} with voxel size {size} is empty or "
+                    "endless; the maximum must exceed the minimum, both finite, and the voxel size be positive."
                 )
             cells = (high - low) / size
-            if abs(cells - round(cells)) > 1e-3:
+            if round(cells) < 1 or abs(cells - round(cells)) > 1e-3:
                 raise ValueError(
                     f"grid.{axis}: {high - low:g} m is {cells:.3f} voxels of {size} m, which is no whole number; "
-                    f"the nearest valid maximum is {low + round(cells) * size:g}."
+                    f"the nearest valid maximum is {low + max(round(cells), 1) * size:g}."
                 )
         if self.max_points_per_voxel < 1 or self.max_voxels < 1:
             raise ValueError("grid: max_points_per_voxel and max_voxels must be at least 1.")
+        if self.overflow not in ("skip", "stop"):
+            raise ValueError(f"grid: overflow {self.overflow!r} is unknown; choose 'skip' or 'stop'.")
         depth, height, width = self.shape
         if depth * height * width >= 2**31:
             raise ValueError(
@@ -217,10 +219,11 @@ class Config:
         multiple = 2 * self.backbone.stride
         for axis, cells in zip("xy", self.grid.cells, strict=False):
             if cells % multiple:
+                below = cells // multiple * multiple
                 raise ValueError(
                     f"grid.{axis}: {cells} voxels are not divisible by {multiple} ({self.backbone.stride} voxels "
-                    f"per BEV cell, halved once more in the neck); the nearest valid counts are "
-                    f"{cells // multiple * multiple} and {(cells // multiple + 1) * multiple}."
+                    f"per BEV cell, halved once more in the neck); the nearest valid count is "
+                    f"{f'{below} or ' if below else ''}{below + multiple}."
                 )
         depths = [shape[0] for shape in self.backbone.stage_shapes(self.grid.shape)]
         if depths[-1] < 1:
@@ -284,7 +287,8 @@ def _build(kind: Any, data: Any, where: str) -> Any:
             raise ValueError(f"{where}: expected {len(kinds)} values, not {len(data)}.")
         return tuple(_build(k, item, f"{where}[{i}]") for i, (k, item) in enumerate(zip(kinds, data, strict=True)))
     if origin is Literal:
-        if data not in arguments:
+        # True == 1 == 1.0, but only one of them is meant.
+        if not any(type(data) is type(argument) and data == argument for argument in arguments):
             raise ValueError(f"{where}: {data!r} is not one of {list(arguments)}.")
         return data
     if kind is float and isinstance(data, int) and not isinstance(data, bool):

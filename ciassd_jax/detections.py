@@ -37,7 +37,9 @@ def select_candidates(
     score, quality = rectify(probability, predictions.iou, config)
     passes = probability >= config.score_threshold
     capacity = min(config.max_candidates, passes.shape[0])
-    best, index = lax.top_k(jnp.where(passes, score, -jnp.inf), capacity)
+    # What is no number could not be ranked: it is counted with the dropped.
+    usable = passes & jnp.isfinite(score) & jnp.isfinite(predictions.box).all(-1)
+    best, index = lax.top_k(jnp.where(usable, score, -jnp.inf), capacity)
     valid = jnp.isfinite(best)
     chosen = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], anchors)
     boxes = box_ops.decode(predictions.box[index], chosen)

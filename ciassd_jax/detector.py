@@ -16,7 +16,7 @@ import numpy as np
 from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.prediction import predict, variables_of
-from ciassd_jax.types import Counts, PointCloud, Variables
+from ciassd_jax.types import Array, Counts, PointCloud, Variables
 from ciassd_jax.weights import load_weights
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class Detector:
         return cls(weights.variables, weights.config)
 
     def __call__(
-        self, points: np.ndarray | Sequence[np.ndarray], *, frustum: np.ndarray | None = None
+        self, points: Array | Sequence[Array], *, frustum: np.ndarray | None = None
     ) -> FrameResult | list[FrameResult]:
         """Detections in points [N, 4] (x, y, z in metres, intensity), or one result for each of a list of them.
 
@@ -106,11 +106,18 @@ class Detector:
         voxels, sites or candidates were dropped, and divides intensities of 0..255 by 255.
         """
         if isinstance(points, np.ndarray | jax.Array):
-            return self.detect(points, frustum=frustum)
-        return [self.detect(cloud, frustum=frustum) for cloud in points]
+            return self._detect(points, frustum)
+        results = []
+        # No comprehension: it would be one more level between a warning and the caller's line.
+        for cloud in points:
+            results.append(self._detect(cloud, frustum))
+        return results
 
-    def detect(self, points: np.ndarray | jax.Array, *, frustum: np.ndarray | None = None) -> FrameResult:
+    def detect(self, points: Array, *, frustum: np.ndarray | None = None) -> FrameResult:
         """Detections of one cloud; as calling the detector with it."""
+        return self._detect(points, frustum)
+
+    def _detect(self, points: Array, frustum: np.ndarray | None) -> FrameResult:
         points = _check_points(np.asarray(points))
         program = self.compile(len(points))
         start = time.perf_counter()
@@ -167,7 +174,7 @@ def _check_points(points: np.ndarray) -> np.ndarray:
         warnings.warn(
             f"{len(points)} intensities of up to {top:g} were divided by 255: the network reads [0, 1].",
             DroppedWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
         points = np.concatenate([points[:, :3], points[:, 3:] / 255], 1)
     return points
@@ -208,4 +215,4 @@ def _warn_of_drops(counts: dict[str, Any], not_finite: int) -> None:
     if counts["candidates"]["dropped"]:
         lost.append(f"{counts['candidates']['dropped']} candidates beyond detection.max_candidates")
     if lost:
-        warnings.warn("Dropped " + "; ".join(lost) + ".", DroppedWarning, stacklevel=3)
+        warnings.warn("Dropped " + "; ".join(lost) + ".", DroppedWarning, stacklevel=4)

@@ -54,7 +54,7 @@ def compiled_memory(config: Config, num_points: int) -> dict[str, Any]:
         lambda leaf: np.zeros(leaf.shape, leaf.dtype),
         jax.eval_shape(partial(init_variables, config=config), jax.random.key(0)),
     )
-    memory = Detector(variables, config).compile(num_points).memory_analysis()
+    memory: Any = Detector(variables, config).compile(num_points).memory_analysis()
     # Not every backend reports its memory.
     return {
         "platform": jax.default_backend(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,8 @@ def predict_raw(state_or_variables: Variables, cloud: PointCloud, config: Config
     """Voxelise and run the network in evaluation mode; `cloud` has a leading batch axis."""
     with jax.named_scope("voxelize"):
         voxels = voxelize_batch(cloud, config.grid)
-    predictions, kept, dropped = CIASSD(config).apply(variables_of(state_or_variables), voxels)
+    output: Any = CIASSD(config).apply(variables_of(state_or_variables), voxels)
+    predictions, kept, dropped = output
     return RawPredictions(predictions, voxels, kept, dropped)
 
 

@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -264,6 +264,7 @@ def _assemble(
     return Weights(variables, config, checked)
 
 
+@cache
 def _expected_shapes(config: Config) -> dict[str, tuple[int, ...]]:
     shapes = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
     return {_name(keys): leaf.shape for keys, leaf in _leaves(shapes)}

@@ -16,9 +16,9 @@ import numpy as np
 OUT = Path(__file__).parents[1] / "ciassd_jax" / "bundled" / "scene.npz"
 SENSOR_HEIGHT = 1.73
 RANGE = 80.0
-# Elevations of the beams and azimuths of the front half, in degrees: the field of KITTI's scanner.
+# Elevations of the beams and azimuths, in degrees: KITTI's scanner, ahead only, about as its camera sees.
 ELEVATIONS = np.linspace(2.0, -24.8, 64)
-AZIMUTHS = np.arange(-90.0, 90.0, 0.25)
+AZIMUTHS = np.arange(-45.0, 45.0, 0.2)
 # Standard deviation of the range in metres, and the part of the beams that does not return.
 RANGE_NOISE, LOSS = 0.015, 0.06
 MINIMUM_POINTS = 10
@@ -57,7 +57,7 @@ OTHERS = np.array(
 
 
 def beams() -> np.ndarray:
-    """Unit directions [R, 3] of all beams of one half turn."""
+    """Unit directions [R, 3] of all beams of one scan."""
     elevation, azimuth = np.meshgrid(np.radians(ELEVATIONS), np.radians(AZIMUTHS), indexing="ij")
     flat = np.cos(elevation)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1).reshape(-1, 3)

@@ -23,7 +23,7 @@ def uniform_by_fan_in(fan_in: int) -> Initializer:
     """U(-1 / sqrt(fan_in), 1 / sqrt(fan_in)), as the released code initialises (SPEC sections 4 to 6)."""
     bound = 1 / math.sqrt(fan_in)
 
-    def init(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
+    def init(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
         return jax.random.uniform(key, shape, dtype, -bound, bound)
 
     return init

@@ -177,9 +177,10 @@ def _average(boxes: Boxes, weights: Float[Array, "K K"], *, align: bool) -> Boxe
     usable = total != 0
     share = weights / jnp.where(usable, total, 1)[:, None]
     own = boxes.to_array()
-    # Differences from the row's own box are small: the mean loses no digits. A box without weight may be
-    # anything, infinite included.
-    offset = jnp.where((weights != 0)[..., None], own[None] - own[:, None], 0)
+    # A box of an infinite size overlaps nothing, but its zero weight times infinity would be no number.
+    finite = jnp.where(jnp.isfinite(own), own, 0)
+    # Differences from the row's own box are small: the mean loses no digits.
+    offset = finite[None] - finite[:, None]
     if align:
         turn = offset[..., 6]
         offset = jnp.asarray(offset).at[..., 6].set(turn - jnp.round(turn / jnp.pi) * jnp.pi)

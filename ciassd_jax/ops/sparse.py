@@ -24,7 +24,7 @@ NO_SITE = np.int32(np.iinfo(np.int32).max)
 
 # Rows of the output computed at once. On a CPU the gathered block must stay in cache; elsewhere large
 # products matter more.
-_BLOCK_ROWS = {"cpu": 1024, "default": 32768}
+_BLOCK_ROWS = {"cpu": 1000, "default": 32000}
 
 
 def linear_keys(coordinates: Int[Array, "*n 3"], shape: Triple) -> Int[Array, "*n"]:
@@ -227,6 +227,11 @@ def _per_platform(function):  # type: ignore[no-untyped-def]
     return choose
 
 
+def _even_rows(slots: int, most: int) -> int:
+    """At most `most` rows in as few blocks of one size as they need: often no row is left to pad."""
+    return -(-slots // -(-slots // most))
+
+
 def _accumulator(dtype: jnp.dtype) -> jnp.dtype:
     return jnp.promote_types(dtype, jnp.float32)
 
@@ -248,7 +253,7 @@ def _gathered(features: Float[Array, "U1 C"], index: Int[Array, "V K"], start: A
 @_per_platform
 def _gather_multiply(features: Array, index: Array, kernel: Array, *, rows: int) -> Array:
     slots, out = index.shape[0], kernel.shape[-1]
-    rows = min(rows, slots)
+    rows = _even_rows(slots, rows)
     index, order, occupied = _blocks(index, features.shape[0], rows)
     padded = jnp.pad(features, ((0, 1), (0, 0)))
     kernel = kernel.reshape(-1, out)
@@ -270,7 +275,7 @@ def _gather_multiply(features: Array, index: Array, kernel: Array, *, rows: int)
 @_per_platform
 def _kernel_gradient(features: Array, index: Array, gradient: Array, *, rows: int) -> Array:
     slots, out = index.shape[0], gradient.shape[-1]
-    rows = min(rows, slots)
+    rows = _even_rows(slots, rows)
     index, order, occupied = _blocks(index, features.shape[0], rows)
     padded = jnp.pad(features, ((0, 1), (0, 0)))
     gradient = jnp.pad(gradient, ((0, index.shape[0] - slots), (0, 0)))

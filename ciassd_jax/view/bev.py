@@ -10,6 +10,7 @@ from jaxtyping import Float
 try:
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
+    from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 except ModuleNotFoundError as error:
@@ -18,6 +19,8 @@ except ModuleNotFoundError as error:
 TRUTH, FOUND = "#d62728", "#13a538"
 # Heights in metres that the colours span: from the ground below the sensor to the roofs of cars and vans.
 HEIGHTS = (-2.0, 1.0)
+# The ground recedes, what stands on it does not; neither is red or green.
+HEIGHT_COLORS = LinearSegmentedColormap.from_list("height", ["#c9c6ba", "#8fa3bd", "#3f6aa8", "#1b2f63"])
 
 
 def plot_bev(
@@ -38,23 +41,24 @@ def plot_bev(
     """
     boxes, truth = _boxes(boxes), _boxes(truth)
     visible = points[np.isfinite(points[:, :3]).all(1)]
-    figure = Figure(figsize=(9.6, 8.0), dpi=150, layout="constrained")
+    x_limits = x_limits or _span(visible, boxes, truth, 0)
+    y_limits = y_limits or _span(visible, boxes, truth, 1)
+    figure = Figure(figsize=_figure_size(x_limits, y_limits), dpi=150, layout="constrained")
     axes = figure.add_subplot()
-    axes.set_facecolor("#f7f7f4")
     # The highest points last: roofs and walls over the ground.
     visible = visible[np.argsort(visible[:, 2], kind="stable")]
     dots = axes.scatter(
-        visible[:, 0], visible[:, 1], c=visible[:, 2], s=1.2, lw=0, cmap="viridis", vmin=HEIGHTS[0], vmax=HEIGHTS[1]
+        visible[:, 0], visible[:, 1], c=visible[:, 2], s=1.6, lw=0, cmap=HEIGHT_COLORS, vmin=HEIGHTS[0], vmax=HEIGHTS[1]
     )
     dots.set_rasterized(True)
-    bar = figure.colorbar(dots, ax=axes, shrink=0.6, pad=0.015, extend="both")
+    bar = figure.colorbar(dots, ax=axes, shrink=0.7, pad=0.015, extend="both")
     bar.set_label("height z (m)")
     _draw_boxes(axes, truth, TRUTH, zorder=3)
     _draw_boxes(axes, boxes, FOUND, zorder=4)
     texts = _captions(len(boxes), scores, labels)
     for box, text in zip(boxes, texts, strict=True):
         _caption(axes, box, text)
-    _dress(axes, x_limits or _span(visible, boxes, truth, 0), y_limits or _span(visible, boxes, truth, 1))
+    _dress(axes, x_limits, y_limits)
     _legend(axes, len(boxes), len(truth))
     axes.set_title(title or "", loc="left")
     return figure
@@ -119,10 +123,16 @@ def _span(points: np.ndarray, boxes: np.ndarray, truth: np.ndarray, axis: int) -
     return float(values.min()) - 2, float(values.max()) + 2
 
 
+def _figure_size(x_limits: tuple[float, float], y_limits: tuple[float, float]) -> tuple[float, float]:
+    """Inches of a picture with little space left around axes of equal scale."""
+    ratio = (y_limits[1] - y_limits[0]) / (x_limits[1] - x_limits[0])
+    return 10.0, min(max(8.2 * ratio + 0.9, 4.0), 12.0)
+
+
 def _dress(axes: Axes, x_limits: tuple[float, float], y_limits: tuple[float, float]) -> None:
     """Metres of equal length along both axes, a light grid and the sensor's place."""
     axes.set(xlim=x_limits, ylim=y_limits, aspect="equal", xlabel="x forward (m)", ylabel="y left (m)")
-    axes.grid(color="#d9d9d4", linewidth=0.6)
+    axes.grid(color="#ebebe8", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.plot(0, 0, marker=">", markersize=9, color="black", zorder=6, clip_on=True)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from jax.sharding import PartitionSpec
+from jax.sharding import Mesh, PartitionSpec
 
 from ciassd_jax.model.layers import (
     EPSILON,
@@ -122,7 +122,7 @@ def test_two_devices_pool_their_entries(second_device):
     rows, whole = PartitionSpec("devices"), PartitionSpec()
     two_devices = jax.shard_map(
         partial(one_device, axis_name="devices"),
-        mesh=jax.make_mesh((2,), ("devices",), devices=jax.devices()[:2]),
+        mesh=Mesh(jax.devices()[:2], ("devices",)),
         in_specs=(whole, rows, rows),
         out_specs=(rows, whole),
     )

@@ -1,0 +1,136 @@
+"""A detector that compiles in seconds, scenes and a calibration for it, and PyTorch files written without PyTorch."""
+
+import io
+import math
+import pickle
+import struct
+import zipfile
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from ciassd_jax import Config, Detector, init_variables, tiny
+
+_PROGRAMS: dict[tuple[Config, int], Any] = {}
+_compile = Detector.compile
+
+
+def small_config() -> Config:
+    """`tiny()` with two stages, few candidates and ordinary NMS, so that random weights find something."""
+    config = tiny()
+    return replace(
+        config,
+        backbone=replace(config.backbone, stages=config.backbone.stages[:2]),
+        detection=replace(config.detection, nms="rotated", max_candidates=16),
+    )
+
+
+@cache
+def random_variables(config: Config, seed: int = 0) -> Any:
+    """Variables of the right shapes without compiling; a negative class bias keeps empty ground empty."""
+    rng = np.random.default_rng(seed)
+    shapes = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
+
+    def draw(keys: tuple, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
+        names = [key.key for key in keys]
+        if names[-1] == "kernel":
+            scale = 0.02 if "box" in names else 1.5
+            return (rng.normal(size=leaf.shape) * scale / math.sqrt(math.prod(leaf.shape[:-1]))).astype(np.float32)
+        if names[-2:] == ["class", "bias"]:
+            return np.full(leaf.shape, -1, np.float32)
+        if names[-2:] == ["iou", "bias"]:
+            return np.full(leaf.shape, 0.8, np.float32)
+        return (np.ones if names[-1] in ("scale", "var") else np.zeros)(leaf.shape, np.float32)
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+def small_cloud(seed: int = 0, count: int = 600) -> np.ndarray:
+    """Points in a few clusters within the range of `tiny()`, inside the view of `CALIBRATION`."""
+    rng = np.random.default_rng(seed)
+    centers = np.stack([rng.uniform(5, 11, 4), rng.uniform(-2, 2, 4), rng.uniform(-1.6, -0.4, 4)], -1)
+    points = centers[rng.integers(4, size=count)] + rng.normal(0, 0.4, (count, 3))
+    return np.concatenate([points, rng.uniform(0, 1, (count, 1))], 1).astype(np.float32)
+
+
+# A camera at the LiDAR that looks along x, of 640 x 480 pixels with a focal length of 300: KITTI has none such.
+CALIBRATION = """\
+P2: 300 0 320 0 0 300 240 0 0 0 1 0
+R0_rect: 1 0 0 0 1 0 0 0 1
+Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
+"""
+IMAGE_SIZE = (640, 480)
+
+
+def share_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile each program once for all detectors of this process."""
+
+    def compile_once(self: Detector, num_points: int) -> Any:
+        key = self.config, self._bucket(num_points)
+        if key not in _PROGRAMS:
+            _PROGRAMS[key] = _compile(self, num_points)
+        return _PROGRAMS[key]
+
+    monkeypatch.setattr(Detector, "compile", compile_once)
+
+
+class _Global:
+    """Pickled as the function or class `module.name`, which need not exist here."""
+
+    def __init__(self, module: str, name: str) -> None:
+        self.text = f"{module}\n{name}\n".encode()
+
+
+class _Storage:
+    def __init__(self, key: str, values: np.ndarray) -> None:
+        self.key, self.values = key, values
+
+
+class _Pickler(pickle._Pickler):
+    """Writes arrays as PyTorch writes tensors."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, 2)
+        self.storages: list[_Storage] = []
+
+    def persistent_id(self, obj: Any) -> Any:
+        if isinstance(obj, _Storage):
+            kind = {"f": "FloatStorage", "i": "LongStorage"}[obj.values.dtype.kind]
+            return "storage", _Global("torch", kind), obj.key, "cpu", obj.values.size
+        return None
+
+    def save(self, obj: Any, save_persistent_id: bool = True) -> None:
+        if isinstance(obj, _Global):
+            self.write(pickle.GLOBAL + obj.text)
+        elif isinstance(obj, np.ndarray):
+            self.storages.append(_Storage(str(len(self.storages)), obj))
+            strides = tuple(stride // obj.itemsize for stride in np.ascontiguousarray(obj).strides)
+            self.save(_Global("torch._utils", "_rebuild_tensor_v2"))
+            self.save((self.storages[-1], 0, obj.shape, strides if obj.ndim else (), False, {}))
+            self.write(pickle.REDUCE)
+        else:
+            super().save(obj, save_persistent_id)
+
+
+def write_pth(path: Path, content: Any, *, legacy: bool = False) -> Path:
+    """Write what `torch.save` would, in the zip format or in the older one."""
+    file = io.BytesIO()
+    pickler = _Pickler(file)
+    pickler.dump(content)
+    raw = {storage.key: np.ascontiguousarray(storage.values) for storage in pickler.storages}
+    if legacy:
+        parts = [pickle.dumps(part, 2) for part in (0x1950A86A20F9469CFC6C, 1001, {"little_endian": True})]
+        parts += [file.getvalue(), pickle.dumps(list(raw), 2)]
+        parts += [struct.pack("<q", values.size) + values.tobytes() for values in raw.values()]
+        path.write_bytes(b"".join(parts))
+    else:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("archive/data.pkl", file.getvalue())
+            for key, values in raw.items():
+                archive.writestr(f"archive/data/{key}", values.tobytes())
+    return path
