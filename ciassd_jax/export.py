@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import export
 
@@ -20,7 +21,7 @@ def export_predict(
     variables: Variables, config: Config, *, num_points: int, batch: int = 1, platforms: Sequence[str] = PLATFORMS
 ) -> bytes:
     """Serialise `predict` for clouds [batch, num_points, 4], with the weights inside, for all platforms at once."""
-    weights = jax.tree.map(np.asarray, variables_of(variables))
+    weights = jax.tree.map(jnp.asarray, variables_of(variables))
 
     def run(points: jax.Array, count: jax.Array, frustum: jax.Array) -> list[jax.Array]:
         return jax.tree.leaves(predict(weights, PointCloud(points, count), config, frustum=frustum))

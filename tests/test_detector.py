@@ -168,7 +168,9 @@ def test_from_pretrained_reads_a_file(tmp_path: Path) -> None:
 
 def test_from_pretrained_says_which_names_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ciassd_jax.detector.BUNDLED", tmp_path)
-    with pytest.raises(FormatError, match=r"'car_best' names no bundled weights \(none are bundled yet\); give the path"):
+    with pytest.raises(
+        FormatError, match=r"'car_best' names no bundled weights \(none are bundled yet\); give the path"
+    ):
         Detector.from_pretrained("car_best")
     config = small_config()
     save_weights(tmp_path / "small.safetensors", random_variables(config), config)

@@ -16,7 +16,9 @@ BOXES = np.array([[10, 2, -1, 4, 2, 1.5, 0], [20, -3, -1, 4, 2, 1.5, np.pi / 2]]
 
 
 def lines_of(figure: Figure, color: str) -> list[np.ndarray]:
-    found = [c for c in figure.axes[0].collections if isinstance(c, LineCollection) and to_hex(c.get_color()[0]) == color]
+    found = [
+        c for c in figure.axes[0].collections if isinstance(c, LineCollection) and to_hex(c.get_color()[0]) == color
+    ]
     return [np.asarray(segment) for collection in found for segment in collection.get_segments()]
 
 

@@ -1,0 +1,120 @@
+"""How long does a real frame take from points to boxes, beside the same network in torch + spconv?
+
+Command: pip install -e '.[peer]' && python benchmarks/bench_predict.py [--frames 10] [--shared ../shared]
+
+Frames go through both detectors in turn, on the same cores, after one warm-up each. Peak memory is that of a process
+of its own for each. `--preset car_lite` times an untrained network of that preset instead, without a peer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import ciassd_jax
+from ciassd_jax.config import PRESETS
+from ciassd_jax.formats import kitti
+from ciassd_jax.formats.points import read_points
+from ciassd_jax.ops.camera import frustum_planes
+
+SHARED = Path(__file__).parents[2] / "shared"
+
+
+def load_frames(shared: Path, number: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Points and frustum of evenly spaced real frames."""
+    clouds = sorted((shared / "kitti/training/velodyne_reduced").glob("*.bin"))
+    frames = []
+    for cloud in clouds[:: max(1, len(clouds) // number)][:number]:
+        calibration = kitti.read_calibration(shared / "kitti/training/calib" / f"{cloud.stem}.txt")
+        width, height = kitti.image_size_for(calibration) or (1242, 375)
+        frames.append(
+            (read_points(cloud), frustum_planes(kitti.lidar_to_image(calibration), width=width, height=height))
+        )
+    return frames
+
+
+def our_detector(shared: Path, preset: str | None) -> ciassd_jax.Detector:
+    """The golden weights, or an untrained network of a preset."""
+    if preset is None:
+        return ciassd_jax.Detector.from_pretrained(shared / "golden/weights.pth")
+    config = PRESETS[preset]()
+    return ciassd_jax.Detector(ciassd_jax.init_variables(jax.random.key(0), config), config)
+
+
+def peer_detector(shared: Path):
+    """The same network in torch + spconv on two threads."""
+    import torch
+    from peer_torch import load_peer
+
+    torch.set_num_threads(2)
+    return load_peer(shared / "golden/weights.safetensors")
+
+
+def measure_alone(kind: str, arguments: argparse.Namespace) -> None:
+    """Run one detector over the frames and print the peak memory of this process in MB."""
+    detector = our_detector(arguments.shared, arguments.preset) if kind == "ours" else peer_detector(arguments.shared)
+    for points, _ in load_frames(arguments.shared, arguments.frames):
+        detector.detect(points)
+    print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3))
+
+
+def peak_memory(kind: str, arguments: argparse.Namespace) -> float:
+    """Peak memory in MB of a fresh process that runs one detector."""
+    command = [sys.executable, __file__, "--alone", kind, "--frames", str(arguments.frames)]
+    command += ["--shared", str(arguments.shared)] + (["--preset", arguments.preset] if arguments.preset else [])
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+
+
+def timed(function, *inputs, **options) -> float:
+    """Seconds of one call."""
+    start = time.perf_counter()
+    function(*inputs, **options)
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    """Time both detectors in turn and print one table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=10)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--shared", type=Path, default=SHARED)
+    parser.add_argument("--preset", choices=sorted(PRESETS))
+    parser.add_argument("--alone", choices=("ours", "peer"))
+    arguments = parser.parse_args()
+    if arguments.alone:
+        measure_alone(arguments.alone, arguments)
+        return
+    frames = load_frames(arguments.shared, arguments.frames)
+    detectors = {"ours": our_detector(arguments.shared, arguments.preset)}
+    if arguments.preset is None:
+        detectors["peer"] = peer_detector(arguments.shared)
+    seconds: dict[str, list[float]] = {name: [] for name in detectors}
+    for detector in detectors.values():
+        detector.detect(frames[0][0])
+    for _ in range(arguments.repeats):
+        for points, planes in frames:
+            for name, detector in detectors.items():
+                options = {"frustum": planes} if name == "ours" else {}
+                seconds[name].append(timed(detector.detect, points, **options))
+    for name, values in seconds.items():
+        print(
+            f"{name}: {1e3 * statistics.median(values):.0f} ms a frame (median; {1e3 * min(values):.0f} to "
+            f"{1e3 * max(values):.0f}), {1 / statistics.median(values):.1f} frames/s, "
+            f"peak {peak_memory(name, arguments):.0f} MB"
+        )
+    if "peer" in seconds:
+        ratio = statistics.median(a / b for a, b in zip(seconds["ours"], seconds["peer"], strict=True))
+        print(f"ours / peer: {ratio:.2f} (median over {len(seconds['ours'])} frames in turn)")
+
+
+if __name__ == "__main__":
+    main()
