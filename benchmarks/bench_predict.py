@@ -9,8 +9,6 @@ of its own for each. `--preset car_lite` times an untrained network of that pres
 from __future__ import annotations
 
 import argparse
-import json
-import resource
 import statistics
 import subprocess
 import sys
@@ -64,14 +62,16 @@ def measure_alone(kind: str, arguments: argparse.Namespace) -> None:
     detector = our_detector(arguments.shared, arguments.preset) if kind == "ours" else peer_detector(arguments.shared)
     for points, _ in load_frames(arguments.shared, arguments.frames):
         detector.detect(points)
-    print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3))
+    # Not getrusage: its maximum is inherited from the process that started this one.
+    status = Path("/proc/self/status").read_text()
+    print(int(status.split("VmHWM:")[1].split()[0]) / 1e3)
 
 
 def peak_memory(kind: str, arguments: argparse.Namespace) -> float:
     """Peak memory in MB of a fresh process that runs one detector."""
     command = [sys.executable, __file__, "--alone", kind, "--frames", str(arguments.frames)]
     command += ["--shared", str(arguments.shared)] + (["--preset", arguments.preset] if arguments.preset else [])
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 
 
 def timed(function, *inputs, **options) -> float:

@@ -104,12 +104,14 @@ class Convert:
     """The file to write: OUT.safetensors."""
 
     def run(self) -> int:
+        from ciassd_jax.formats.writing import check_folder
         from ciassd_jax.weights import load_released_weights, save_weights
 
         if self.out.suffix != ".safetensors":
             raise FormatError(f"{self.out} must end in .safetensors; name the output so.")
         if self.out.resolve() == self.source.resolve():
             raise FormatError(f"{self.out} is the input itself; name another output.")
+        check_folder(self.out.parent)
         weights = load_released_weights(self.source)
         for row in weights.report:
             print(f"{row.status:<10}  {row.source:<58}  {row.target:<50}  {row.shape}")

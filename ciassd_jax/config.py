@@ -329,12 +329,12 @@ def car_lite() -> Config:
         backbone=BackboneConfig(
             stages=(
                 StageConfig(channels=16, layers=1, capacity=14000),
-                StageConfig(channels=16, layers=1, capacity=16000),
-                StageConfig(channels=32, layers=1, capacity=10000),
+                StageConfig(channels=16, layers=1, capacity=18000),
+                StageConfig(channels=32, layers=1, capacity=12000),
                 StageConfig(channels=32, layers=2, capacity=5000),
             ),
             out_channels=32,
-            out_capacity=2500,
+            out_capacity=3000,
         ),
         neck=NeckConfig(channels=64),
         detection=DetectionConfig(max_candidates=256),

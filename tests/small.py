@@ -1,13 +1,8 @@
-"""A detector that compiles in seconds, scenes and a calibration for it, and PyTorch files written without PyTorch."""
+"""A detector that compiles in seconds, with a scene and a camera for it."""
 
-import io
 import math
-import pickle
-import struct
-import zipfile
 from dataclasses import replace
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -77,60 +72,3 @@ def share_programs(monkeypatch: pytest.MonkeyPatch) -> None:
         return _PROGRAMS[key]
 
     monkeypatch.setattr(Detector, "compile", compile_once)
-
-
-class _Global:
-    """Pickled as the function or class `module.name`, which need not exist here."""
-
-    def __init__(self, module: str, name: str) -> None:
-        self.text = f"{module}\n{name}\n".encode()
-
-
-class _Storage:
-    def __init__(self, key: str, values: np.ndarray) -> None:
-        self.key, self.values = key, values
-
-
-class _Pickler(pickle._Pickler):
-    """Writes arrays as PyTorch writes tensors."""
-
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file, 2)
-        self.storages: list[_Storage] = []
-
-    def persistent_id(self, obj: Any) -> Any:
-        if isinstance(obj, _Storage):
-            kind = {"f": "FloatStorage", "i": "LongStorage"}[obj.values.dtype.kind]
-            return "storage", _Global("torch", kind), obj.key, "cpu", obj.values.size
-        return None
-
-    def save(self, obj: Any, save_persistent_id: bool = True) -> None:
-        if isinstance(obj, _Global):
-            self.write(pickle.GLOBAL + obj.text)
-        elif isinstance(obj, np.ndarray):
-            self.storages.append(_Storage(str(len(self.storages)), obj))
-            strides = tuple(stride // obj.itemsize for stride in np.ascontiguousarray(obj).strides)
-            self.save(_Global("torch._utils", "_rebuild_tensor_v2"))
-            self.save((self.storages[-1], 0, obj.shape, strides if obj.ndim else (), False, {}))
-            self.write(pickle.REDUCE)
-        else:
-            super().save(obj, save_persistent_id)
-
-
-def write_pth(path: Path, content: Any, *, legacy: bool = False) -> Path:
-    """Write what `torch.save` would, in the zip format or in the older one."""
-    file = io.BytesIO()
-    pickler = _Pickler(file)
-    pickler.dump(content)
-    raw = {storage.key: np.ascontiguousarray(storage.values) for storage in pickler.storages}
-    if legacy:
-        parts = [pickle.dumps(part, 2) for part in (0x1950A86A20F9469CFC6C, 1001, {"little_endian": True})]
-        parts += [file.getvalue(), pickle.dumps(list(raw), 2)]
-        parts += [struct.pack("<q", values.size) + values.tobytes() for values in raw.values()]
-        path.write_bytes(b"".join(parts))
-    else:
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr("archive/data.pkl", file.getvalue())
-            for key, values in raw.items():
-                archive.writestr(f"archive/data/{key}", values.tobytes())
-    return path

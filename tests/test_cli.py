@@ -11,18 +11,20 @@ import sys
 import warnings
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import pytest
 import safetensors.numpy
-from small import CALIBRATION, IMAGE_SIZE, random_variables, share_programs, small_cloud, small_config, write_pth
-from test_weights import released_state
+from released import released_state, write_pth
+from small import CALIBRATION, IMAGE_SIZE, random_variables, share_programs, small_cloud, small_config
 
-from ciassd_jax import load_weights, save_weights, tiny
+from ciassd_jax import Detector, load_weights, save_weights, tiny
 from ciassd_jax.cli import Preset, main
 from ciassd_jax.config import PRESETS
+from ciassd_jax.detector import FrameResult
 from ciassd_jax.formats.kitti import read_rows
 from ciassd_jax.formats.points import write_bin
 
@@ -124,8 +126,8 @@ def test_all_formats_of_points_agree(run: Any, weights: Path, tmp_path: Path) ->
 def expected_rows(data: Any) -> list[tuple[float, ...]]:
     """Dimensions, location and rotation_y of each box for the camera of `CALIBRATION`."""
     return [
-        (h, w, l, -y, h / 2 - z, x, (math.pi / 2 - yaw) % (2 * math.pi) - math.pi)
-        for x, y, z, l, w, h, yaw in data["boxes"]
+        (height, width, length, -y, height / 2 - z, x, (math.pi / 2 - yaw) % (2 * math.pi) - math.pi)
+        for x, y, z, length, width, height, yaw in data["boxes"]
     ]
 
 
@@ -212,12 +214,20 @@ def test_other_warnings_are_left_alone(run: Any, weights: Path, tmp_path: Path, 
         run("predict", tmp_path / "a.bin", "--weights", weights, "--out", tmp_path / "out")
 
 
-def test_threshold_and_dtype_override_the_file(run: Any, weights: Path, tmp_path: Path) -> None:
+def test_threshold_and_dtype_override_the_file(run: Any, weights: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    configs = []
+
+    def detect(detector: Detector, frame: Any) -> FrameResult:
+        configs.append(detector.config)
+        return FrameResult(np.zeros((0, 7)), np.zeros(0), (), {}, 0.0)
+
     write_bin(tmp_path / "a.bin", small_cloud())
-    common = ("predict", tmp_path / "a.bin", "--weights", weights, "--out", tmp_path / "out", "--dtype", "bfloat16")
-    result = run(*common, "--score-threshold", "0.99")
-    assert result.code == 0
-    assert "0 detections" in result.out
+    monkeypatch.setattr("ciassd_jax.predict_files.detect_frame", detect)
+    common = ("predict", tmp_path / "a.bin", "--weights", weights, "--out", tmp_path / "out")
+    assert run(*common, "--dtype", "bfloat16", "--score-threshold", "0.7").code == 0
+    assert run(*common).code == 0
+    detection = replace(small_config().detection, score_threshold=0.7)
+    assert configs == [replace(small_config(), dtype="bfloat16", detection=detection), small_config()]
 
 
 class Evil:
@@ -242,6 +252,12 @@ def write(path: Path, data: bytes) -> Path:
     return path
 
 
+def folder_of(folder: Path, contents: dict[str, bytes]) -> Path:
+    for name, data in contents.items():
+        write(folder / name, data)
+    return folder
+
+
 GOOD = small_cloud().astype("<f4").tobytes()
 # Arguments after `predict` that stand in for the good ones, and what the sentence must say.
 BAD: dict[str, tuple[Callable[[Path], dict[str, Any]], str]] = {
@@ -255,11 +271,11 @@ BAD: dict[str, tuple[Callable[[Path], dict[str, Any]], str]] = {
     ),
     "no clouds": (lambda t: {"path": write(t / "d" / "a.txt", b"").parent}, r"d holds no point cloud; give a folder"),
     "same stems": (
-        lambda t: {"path": [write(t / "d" / f"a.{end}", GOOD) for end in ("bin", "npy")][0].parent},
+        lambda t: {"path": folder_of(t / "d", {"a.bin": GOOD, "a.npy": GOOD})},
         r"a\.bin and .*a\.npy would both be written as a\.json; rename one",
     ),
     "one of a folder": (
-        lambda t: {"path": [write(t / "d" / f"{i}.bin", GOOD[: len(GOOD) - i]) for i in (0, 1)][0].parent},
+        lambda t: {"path": folder_of(t / "d", {"0.bin": GOOD, "1.bin": GOOD[:-1]})},
         r"1\.bin has 9599 bytes",
     ),
     "missing weights": (lambda t: {"weights": t / "w.safetensors"}, r"w\.safetensors is no file; check the path"),
@@ -381,7 +397,7 @@ def test_convert_refuses_what_it_must(run: Any, weights: Path, tmp_path: Path) -
     for source, target, message in [
         (path, tmp_path / "out.npz", "out.npz must end in .safetensors"),
         (path, path, "released.safetensors is the input itself; name another output"),
-        (path, weights / "out.safetensors", "cannot be written (Not a directory)"),
+        (path, weights / "out.safetensors", "small.safetensors cannot be a folder, as "),
         (weights, tmp_path / "out.safetensors", "is already a file of ours"),
         (tmp_path / "none.pth", tmp_path / "out.safetensors", "does not exist; check the path"),
         (evil_pth(tmp_path / "evil.pth"), tmp_path / "out.safetensors", "asks to run"),
@@ -487,10 +503,10 @@ def test_a_real_frame_gives_the_golden_boxes(run: Any, shared: Path, tmp_path: P
     assert result.code == 0
     data = json.loads((tmp_path / "000010.json").read_text())
     with np.load(shared / "golden" / "network.npz") as golden:
-        x, y, z, w, l, h, r = golden["000010_final_boxes"].T
+        x, y, z, width, length, height, r = golden["000010_final_boxes"].T
         scores = golden["000010_final_scores"]
     found = np.array(data["boxes"])
-    np.testing.assert_allclose(found[:, :6], np.stack([x, y, z, l, w, h], 1), atol=5e-3)
+    np.testing.assert_allclose(found[:, :6], np.stack([x, y, z, length, width, height], 1), atol=5e-3)
     turn = found[:, 6] + r + np.pi / 2
     np.testing.assert_allclose(turn - 2 * np.pi * np.round(turn / (2 * np.pi)), 0, atol=5e-3)
     np.testing.assert_allclose(data["scores"], scores, atol=1e-3)

@@ -380,15 +380,18 @@ def assert_cluster_supports(scene: Scene, clusters: list[Cluster]) -> None:
 
 
 def test_an_overlap_at_the_limit_itself():
-    """Released: suppressed from the limit on, averaged only above it. Paper: both only above it."""
-    candidates = row_of_candidates([10, 11])
+    """Released: suppressed from the limit on, averaged only above it. Paper: both only above it.
+
+    At 45 m, where the Gaussian would give the other box a weight of exp(-2.5).
+    """
+    candidates = row_of_candidates([45, 46])
     thresholds = jnp.full(2, 0.1)
     _, released = run_released(candidates, thresholds, overlap=0.5)
     assert released.selected.tolist() == [True, False]
-    np.testing.assert_allclose(released.boxes.center[0], [10, 0, 0])
+    np.testing.assert_allclose(released.boxes.center[0], [45, 0, 0])
     _, paper = run_paper(candidates, thresholds, overlap=0.5)
     assert paper.selected.tolist() == [True, True]
-    np.testing.assert_allclose(paper.boxes.center[:, 0], [10, 11])
+    np.testing.assert_allclose(paper.boxes.center[:, 0], [45, 46])
 
 
 def test_support_must_exceed_the_threshold():

@@ -1,0 +1,219 @@
+"""The whole network on the tiny preset, and what the car presets would compute, without computing it."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ciassd_jax import config as presets
+from ciassd_jax.model.backbone import SPConvNet
+from ciassd_jax.model.detector import CIASSD, init_variables
+from ciassd_jax.prediction import postprocess, predict, predict_raw, voxelize_batch
+from ciassd_jax.types import PointCloud
+
+ROWS = 1024
+TINY = presets.tiny()
+DENSE = replace(TINY, backbone=replace(TINY.backbone, backend="dense"))
+run = jax.jit(predict_raw, static_argnames="config")
+
+
+@jax.jit
+@partial(chex.assert_max_traces, n=1)
+def run_one(variables, cloud):
+    """The two halves of `predict` on one scene of ROWS points: all tests of this module share one compile."""
+    raw = predict_raw(variables, cloud, TINY)
+    return raw, postprocess(raw, cloud, TINY)
+
+
+@cache
+def shapes_of(config: presets.Config) -> dict:
+    return jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def variables() -> dict:
+    """Random ones, with BatchNorm statistics and biases that matter."""
+    rng = np.random.default_rng(0)
+
+    def draw(path, leaf):
+        name = path[-1].key
+        if name == "kernel":
+            return rng.normal(size=leaf.shape) / np.sqrt(leaf.size / leaf.shape[-1] / 2)
+        return rng.uniform(0.5, 1.5, leaf.shape) - (name in ("bias", "mean"))
+
+    return jax.tree.map(jnp.float32, jax.tree_util.tree_map_with_path(draw, shapes_of(TINY)))
+
+
+def random_points(seed: int, number: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    low, high = TINY.grid.minimum, TINY.grid.maximum
+    points = rng.uniform([*low, 0], [*high, 1], (number, 4))
+    # Every other point near the one before it, so that voxels hold several.
+    points[1::2, :3] = points[: number - number % 2 : 2, :3] + rng.uniform(0, 0.05, (number // 2, 3))
+    return points.astype(np.float32)
+
+
+def batch_of(*scenes: np.ndarray, padding: np.ndarray | None = None) -> PointCloud:
+    """Padded with points that would count, were they not padding."""
+    padding = random_points(99, ROWS) if padding is None else padding
+    padded = [np.concatenate([points, padding])[:ROWS] for points in scenes]
+    return PointCloud(np.stack(padded), np.array([len(points) for points in scenes], np.int32))
+
+
+SCENES = [random_points(seed, number) for seed, number in enumerate((300, 0, 1, ROWS))]
+
+
+def assert_close(mine, reference, tolerance: float = 1e-5) -> None:
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=0, atol=tolerance), mine, reference)
+
+
+def test_parameter_counts():
+    def count(config):
+        return sum(leaf.size for leaf in jax.tree.leaves(shapes_of(config)["params"]))
+
+    assert count(presets.car_released()) == 3_813_720
+    # Two 3 x 3 attention convolutions for 1 x 1 ones; the IoU branch 1 x 1 with bias for 3 x 3 without.
+    assert count(presets.car()) == 3_813_720 + 2 * 8 * 128 - 8 * 128 * 2 + 2
+
+
+def test_parameter_shapes_of_the_car():
+    params = shapes_of(presets.car())["params"]
+    assert params["neck"]["spatial_attention"]["kernel"].shape == (3, 3, 128, 1)
+    assert params["neck"]["semantic_attention"]["kernel"].shape == (3, 3, 128, 1)
+    assert jax.tree.map(jnp.shape, params["head"]["iou"]) == {"kernel": (1, 1, 128, 2), "bias": (2,)}
+    released = shapes_of(presets.car_released())["params"]
+    assert released["neck"]["spatial_attention"]["kernel"].shape == (1, 1, 128, 1)
+    assert jax.tree.map(jnp.shape, released["head"]["iou"]) == {"kernel": (3, 3, 128, 2)}
+
+
+def test_one_compile_serves_0_1_and_all_points(variables):
+    for number in (0, 1, ROWS):
+        raw, detections = run_one(variables, batch_of(random_points(5, number)))
+        assert detections.counts.points_given.tolist() == [number]
+        assert (detections.counts.voxels_kept > 0).tolist() == [number > 0]
+        chex.assert_tree_all_finite((raw, detections))
+
+
+def test_a_scene_ignores_its_batch_mates(variables):
+    """A batch of four equals four singles, and changing the others changes nothing."""
+    together = run(variables, batch_of(*SCENES), TINY)
+    for i, points in enumerate(SCENES):
+        alone, _ = run_one(variables, batch_of(points))
+        assert_close(jax.tree.map(lambda leaf, i=i: leaf[i], together), jax.tree.map(lambda leaf: leaf[0], alone))
+    others = run(variables, batch_of(SCENES[0], SCENES[3], SCENES[3], SCENES[1]), TINY)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), together, others)
+    assert abs(together.predictions.box[0] - together.predictions.box[1]).max() > 0.01
+    assert together.sites_dropped[3].any()
+
+
+def test_an_empty_batch_is_finite(variables):
+    raw = run(variables, batch_of(*[SCENES[1]] * 4), TINY)
+    assert not raw.voxels.count.any()
+    assert not raw.sites_kept.any()
+    chex.assert_tree_all_finite(raw)
+
+
+def test_order_of_points_is_irrelevant(variables):
+    shuffled = np.random.default_rng(0).permutation(SCENES[0])
+    (first, _), (second, _) = (run_one(variables, batch_of(points)) for points in (SCENES[0], shuffled))
+    assert 1 < first.voxels.num_points.max() < TINY.grid.max_points_per_voxel
+    assert_close(second.predictions, first.predictions)
+
+
+def test_what_stands_in_padding_is_inert(variables):
+    results = [
+        run_one(variables, batch_of(SCENES[0], padding=padding))
+        for padding in (random_points(7, ROWS), np.full((ROWS, 4), np.nan, np.float32))
+    ]
+    jax.tree.map(np.testing.assert_array_equal, *results)
+
+
+@partial(jax.jit, static_argnames="config")
+def train_backbone(variables, voxels, config):
+    """Outputs and new statistics in training mode, and the gradient of a sum of the BEV map by the parameters."""
+    backbone = SPConvNet(config.backbone, config.grid.shape, jnp.dtype("float32"))
+
+    def total(params):
+        outputs, updated = backbone.apply(
+            {"params": params, "batch_stats": variables["batch_stats"]["backbone"]},
+            voxels,
+            train=True,
+            mutable=["batch_stats"],
+        )
+        weight = jnp.cos(jnp.arange(outputs[0].size, dtype=jnp.float32)).reshape(outputs[0].shape)
+        return (outputs[0] * weight).sum(), (outputs, updated)
+
+    gradients, (outputs, updated) = jax.grad(total, has_aux=True)(variables["params"]["backbone"])
+    return outputs, updated, gradients
+
+
+def test_backends_agree(variables):
+    """Predictions; and of the backbone in training, where alone they differ, the gradients by all parameters."""
+    cloud = batch_of(*SCENES)
+    assert_close(run(variables, cloud, TINY), run(variables, cloud, DENSE))
+    voxels = voxelize_batch(cloud, TINY.grid)
+    *outputs, gradients = train_backbone(variables, voxels, TINY)
+    *dense_outputs, dense_gradients = train_backbone(variables, voxels, DENSE)
+    assert_close(outputs, dense_outputs)
+
+    def assert_close_to_scale(path, mine, reference):
+        scale = abs(reference).max()
+        assert scale > 0, path
+        np.testing.assert_allclose(mine / scale, reference / scale, rtol=0, atol=1e-5, err_msg=str(path))
+
+    jax.tree_util.tree_map_with_path(assert_close_to_scale, gradients, dense_gradients)
+
+
+def test_training_on_an_empty_batch_is_finite(variables):
+    voxels = voxelize_batch(batch_of(*[SCENES[1]] * 4), TINY.grid)
+    outputs, updated, gradients = train_backbone(variables, voxels, TINY)
+    chex.assert_tree_all_finite((outputs, gradients))
+    jax.tree.map(np.testing.assert_array_equal, updated["batch_stats"], variables["batch_stats"]["backbone"])
+
+
+def test_shifted_voxels_shift_the_bev_map(variables):
+    """By one cell (the backbone's stride) along x and two along y; the features stay."""
+    stride, low = TINY.backbone.stride, np.array(TINY.grid.minimum[:2])
+    scenes = [points.copy() for points in SCENES]
+    for points in scenes:
+        points[:, :2] = np.array([3.2, -3.2]) + 0.4 * (points[:, :2] - low)
+    voxels = jax.tree.map(np.asarray, voxelize_batch(batch_of(*scenes), TINY.grid))
+    real = np.arange(voxels.coordinates.shape[1])[None] < voxels.count[:, None]
+    shift = np.where(real[..., None], np.array([0, 2 * stride, stride]), 0).astype(np.int32)
+    (bev, *_), *_ = train_backbone(variables, voxels, TINY)
+    (shifted, *_), *_ = train_backbone(variables, voxels._replace(coordinates=voxels.coordinates + shift), TINY)
+    assert bev.shape == (4, *TINY.bev_shape, TINY.bev_channels)
+    assert bev[0].any(-1).sum() > 50
+    assert_close(shifted[:, 2:, 1:], bev[:, :-2, :-1])
+
+
+def equations(jaxpr):
+    """All equations of a jaxpr, those of loops, branches and calls included."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for parameter in equation.params.values():
+            for inner in parameter if isinstance(parameter, tuple | list) else (parameter,):
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from equations(inner)
+
+
+def test_the_car_never_holds_a_dense_grid():
+    """No array of a whole 3D grid at any stage but the BEV map's, in any branch for any platform."""
+    config = presets.car()
+    cloud = PointCloud(jax.ShapeDtypeStruct((1, 32768, 4), np.float32), jax.ShapeDtypeStruct((1,), np.int32))
+    jaxpr = jax.make_jaxpr(partial(predict, config=config))(shapes_of(config), cloud)
+    found = list(equations(jaxpr.jaxpr))
+    # The walk reaches the products inside of the loop over blocks.
+    names = {equation.primitive.name for equation in found}
+    assert {"while", "dot_general", "conv_general_dilated"} <= names
+    shapes = {tuple(variable.aval.shape) for equation in found for variable in equation.outvars}
+    assert max(np.prod(shape, dtype=int) for shape in shapes) < 64 * 2**20
+    for grid in config.backbone.stage_shapes(config.grid.shape)[:-1]:
+        cells = np.prod(grid, dtype=int)
+        channels = {1, 3, 4, 16, 27, 32, 64}
+        assert not [shape for shape in shapes if np.prod(shape, dtype=int) in {cells * c for c in channels}], grid
