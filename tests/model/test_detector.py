@@ -11,7 +11,7 @@ import pytest
 
 from ciassd_jax import config as presets
 from ciassd_jax.model.backbone import SPConvNet
-from ciassd_jax.model.detector import CIASSD, init_variables
+from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import postprocess, predict, predict_raw, voxelize_batch
 from ciassd_jax.types import PointCloud
 

@@ -1,0 +1,143 @@
+"""The network with the reference weights equals the released code on real frames, stage by stage."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ciassd_jax.config import HeadConfig
+from ciassd_jax.model.detector import CIASSD
+from ciassd_jax.model.head import MultiTaskHead
+from ciassd_jax.ops import boxes as box_ops
+from ciassd_jax.ops.camera import frustum_planes
+from ciassd_jax.ops.sparse import linear_keys
+from ciassd_jax.prediction import RawPredictions, postprocess, voxelize_batch
+from ciassd_jax.types import PointCloud
+from ciassd_jax.weights import load_weights
+
+FRAMES = ("000010", "000068", "000095")
+pytestmark = [pytest.mark.reference, pytest.mark.xdist_group("golden_network")]
+
+
+@cache
+def network(shared: Path):
+    """Weights, and the compiled network that keeps what every layer gave."""
+    weights = load_weights(shared / "golden" / "weights.pth")
+
+    @jax.jit
+    def run(variables, voxels):
+        keep = lambda module, _: module.name in ("backbone", "neck", "stage0_0", "stage1_down", "stage3_2", "out")  # noqa: E731
+        return CIASSD(weights.config).apply(variables, voxels, capture_intermediates=keep, mutable=["intermediates"])
+
+    return weights, run
+
+
+@cache
+def result(shared: Path, frame: str):
+    """The frame's cloud, voxels, outputs and intermediate results."""
+    weights, run = network(shared)
+    points = np.load(shared / "golden" / f"voxel_{frame}.npz")["points"]
+    padded = np.zeros((1, 20000, 4), np.float32)
+    padded[0, : len(points)] = points
+    cloud = PointCloud(padded, np.array([len(points)], np.int32))
+    voxels = jax.jit(voxelize_batch, static_argnames="grid")(cloud, weights.config.grid)
+    output, kept = run(weights.variables, voxels)
+    return cloud, voxels, output, kept["intermediates"]
+
+
+@pytest.fixture(scope="module")
+def golden(shared: Path) -> dict[str, np.ndarray]:
+    return dict(np.load(shared / "golden" / "network.npz"))
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_active_sites(shared: Path, golden: dict, frame: str) -> None:
+    _, voxels, (_, kept, dropped), _ = result(shared, frame)
+    counts = golden[f"{frame}_stage_active_counts"]
+    assert int(voxels.count[0]) == counts[0]
+    np.testing.assert_array_equal(kept[0], counts[[2, 5, 9, 13]])
+    assert int(dropped.sum()) == 0
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_bev_map(shared: Path, golden: dict, frame: str) -> None:
+    bev = np.asarray(result(shared, frame)[3]["backbone"]["__call__"][0][0])[0].transpose(2, 0, 1)
+    np.testing.assert_allclose(
+        bev.reshape(-1)[golden[f"{frame}_bev_index"]], golden[f"{frame}_bev_value"], rtol=0, atol=1e-4
+    )
+    np.testing.assert_allclose(bev.sum((1, 2), dtype=float), golden[f"{frame}_bev_channel_sum"], rtol=1e-5, atol=1e-2)
+    active = np.unpackbits(golden[f"{frame}_bev_active_bits"])[: 2 * 200 * 176].reshape(2, 200, 176).astype(bool)
+    by_layer = bev.reshape(64, 2, 200, 176)
+    assert not by_layer[:, ~active].any()
+
+
+def test_sampled_layers(shared: Path, golden: dict) -> None:
+    _, voxels, _, kept = result(shared, "000010")
+    at = golden["000010_stage00_coords"].astype(np.int32)
+    keys = np.asarray(linear_keys(voxels.coordinates[0], (41, 1600, 1408)))[: int(voxels.count[0])]
+    rows = np.searchsorted(keys, np.asarray(linear_keys(jnp.asarray(at), (41, 1600, 1408))))
+    features = np.asarray(kept["backbone"]["stage0_0"]["__call__"][0])
+    np.testing.assert_allclose(features[rows], golden["000010_stage00_act"], rtol=0, atol=1e-4)
+    for layer, stage in (("stage0_0", "00"), ("stage1_down", "06"), ("stage3_2", "36"), ("out", "39")):
+        total = np.asarray(kept["backbone"][layer]["__call__"][0]).sum(0, dtype=float)
+        np.testing.assert_allclose(total, golden[f"000010_stage{stage}_act_channel_sum"], rtol=1e-5, atol=1e-2)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_neck(shared: Path, golden: dict, frame: str) -> None:
+    ssfa = np.asarray(result(shared, frame)[3]["neck"]["__call__"][0])[0].transpose(2, 0, 1)
+    difference = np.abs(ssfa.reshape(-1)[golden[f"{frame}_ssfa_index"]] - golden[f"{frame}_ssfa_value"])
+    assert difference.max() <= 5e-3
+    assert difference.mean() <= 1e-5
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_heads(shared: Path, golden: dict, frame: str) -> None:
+    predictions = result(shared, frame)[2][0]
+    for mine, name, tolerance in (
+        (predictions.box, "box_preds", 5e-4),
+        (predictions.class_logit, "cls_preds", 5e-3),
+        (predictions.direction, "dir_cls_preds", 1e-3),
+        (predictions.iou, "iou_preds", 2e-4),
+    ):
+        np.testing.assert_allclose(
+            np.asarray(mine).reshape(-1), golden[f"{frame}_{name}"].reshape(-1), rtol=0, atol=tolerance
+        )
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_the_other_iou_head(shared: Path, golden: dict, frame: str) -> None:
+    weights, _ = network(shared)
+    head = replace(weights.config.head, iou_kernel=1, iou_bias=True)
+    assert isinstance(head, HeadConfig)
+    iou = {
+        "kernel": golden["alt_conv_iou_weight"].transpose(2, 3, 1, 0),
+        "bias": golden["alt_conv_iou_bias"],
+    }
+    params = {"params": weights.variables["params"]["head"] | {"iou": iou}}
+    features = result(shared, frame)[3]["neck"]["__call__"][0]
+    predictions = jax.jit(MultiTaskHead(head, 2, jnp.dtype("float32")).apply)(params, features)
+    expected = golden[f"{frame}_alt_iou_preds"].reshape(-1)
+    np.testing.assert_allclose(np.asarray(predictions.iou)[0], expected, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_final_boxes(shared: Path, golden: dict, frame: str) -> None:
+    weights, _ = network(shared)
+    cloud, voxels, (predictions, kept, dropped), _ = result(shared, frame)
+    height, width = golden[f"{frame}_image_shape"]
+    projection = golden[f"{frame}_P2"][:3] @ golden[f"{frame}_R0_rect"] @ golden[f"{frame}_Tr_velo_to_cam"]
+    planes = frustum_planes(projection, width=int(width), height=int(height))[None].astype(np.float32)
+    raw = RawPredictions(predictions, voxels, kept, dropped)
+    detections = jax.jit(postprocess, static_argnames="config")(raw, cloud, weights.config, frustum=planes)
+    expected = golden[f"{frame}_final_boxes"]
+    count = int(detections.count[0])
+    assert count == len(expected)
+    difference = np.asarray(box_ops.to_paper(detections.boxes))[0, :count] - expected
+    difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(difference).max() <= 5e-3
+    np.testing.assert_allclose(detections.score[0, :count], golden[f"{frame}_final_scores"], rtol=0, atol=1e-3)
