@@ -318,18 +318,19 @@ def car_released() -> Config:
 
 
 def car_lite() -> Config:
-    """The same method sized for a CPU: at least ten frames a second on two cores (benchmarks/README.md).
+    """The same method sized for a CPU: about ten frames a second on two cores (benchmarks/README.md).
 
     Voxels of twice the size quarter the BEV map to cells of 0.8 m, where the neck spends its time, and leave two
     thirds of the sites. Half the neck's width quarters its arithmetic again. A map of 0.4 m with a neck of 32
-    channels would cost half as much again: convolutions of so few channels run on one core.
+    channels would cost half as much again: convolutions of so few channels run on one core. The second stage, with
+    the most sites, only strides.
     """
     return Config(
         grid=GridConfig(voxel_size=(0.1, 0.1, 0.2), max_voxels=14000),
         backbone=BackboneConfig(
             stages=(
-                StageConfig(channels=16, layers=1, capacity=14000),
-                StageConfig(channels=16, layers=1, capacity=18000),
+                StageConfig(channels=8, layers=1, capacity=14000),
+                StageConfig(channels=16, layers=0, capacity=18000),
                 StageConfig(channels=32, layers=1, capacity=12000),
                 StageConfig(channels=32, layers=2, capacity=5000),
             ),

@@ -411,12 +411,18 @@ def test_centres_outside_the_range_are_dropped():
             assert len(boxes) == wanted, (center, config.detection.nms)
 
 
-def test_frustum_filters_by_centre_only_when_given():
-    """The half-space y > 5 alone (the others always hold); strict."""
+def test_frustum_filters_by_averaged_centre_only_when_given():
+    """The half-space y > 5 alone (the others always hold); strict. The first two averages cross its border."""
     planes = jnp.array([[0, 1, 0, -5.0]] + [[0, 0, 0, 1.0]] * 5)
-    given = scene([*three_at(20, 4.5), *three_at(30, 5.5), *three_at(40, 5.0)])
-    np.testing.assert_allclose(final(detect(*given, car()))[0][:, 1], [4.5, 5.5, 5.0], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(final(detect(*given, car(), planes))[0][:, 1], [5.5], rtol=0, atol=1e-5)
+    crossing = [
+        [(x, seed, -1, -2.0), *[(x, other, -1, -2.0)] * 2] for x, seed, other in [(45, 4.95, 5.15), (50, 5.05, 4.85)]
+    ]
+    given = scene([*crossing[0], *crossing[1], *three_at(30, 5.0)])
+    boxes, *_ = final(detect(*given, car()))
+    assert (boxes[:, 1] > 5).tolist() == [True, False, False]
+    np.testing.assert_array_equal(boxes[2, 1], 5)
+    filtered, *_ = final(detect(*given, car(), planes))
+    np.testing.assert_allclose(filtered, boxes[:1], rtol=0, atol=1e-5)
 
 
 def test_classes_have_their_own_support_threshold_and_do_not_mix():

@@ -13,11 +13,12 @@ from ciassd_jax import config as presets
 from ciassd_jax.model.backbone import SPConvNet
 from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import postprocess, predict, predict_raw, voxelize_batch
-from ciassd_jax.types import PointCloud
+from ciassd_jax.types import PointCloud, SparseVoxels
 
 ROWS = 1024
 TINY = presets.tiny()
-DENSE = replace(TINY, backbone=replace(TINY.backbone, backend="dense"))
+# A quarter of its area, for training by the dense definition.
+SMALL = replace(TINY, grid=replace(TINY.grid, minimum=(0.0, -3.2, -3.0), maximum=(6.4, 3.2, 1.0)))
 run = jax.jit(predict_raw, static_argnames="config")
 
 
@@ -27,6 +28,10 @@ def run_one(variables, cloud):
     """The two halves of `predict` on one scene of ROWS points: all tests of this module share one compile."""
     raw = predict_raw(variables, cloud, TINY)
     return raw, postprocess(raw, cloud, TINY)
+
+
+def dense(config: presets.Config) -> presets.Config:
+    return replace(config, backbone=replace(config.backbone, backend="dense"))
 
 
 @cache
@@ -48,9 +53,9 @@ def variables() -> dict:
     return jax.tree.map(jnp.float32, jax.tree_util.tree_map_with_path(draw, shapes_of(TINY)))
 
 
-def random_points(seed: int, number: int) -> np.ndarray:
+def random_points(seed: int, number: int, grid: presets.GridConfig = TINY.grid) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    low, high = TINY.grid.minimum, TINY.grid.maximum
+    low, high = grid.minimum, grid.maximum
     points = rng.uniform([*low, 0], [*high, 1], (number, 4))
     # Every other point near the one before it, so that voxels hold several.
     points[1::2, :3] = points[: number - number % 2 : 2, :3] + rng.uniform(0, 0.05, (number // 2, 3))
@@ -151,13 +156,21 @@ def train_backbone(variables, voxels, config):
     return outputs, updated, gradients
 
 
+def small_voxels(*numbers: int) -> SparseVoxels:
+    scenes = [random_points(seed, number, SMALL.grid) for seed, number in enumerate(numbers)]
+    return jax.tree.map(np.asarray, voxelize_batch(batch_of(*scenes), SMALL.grid))
+
+
 def test_backends_agree(variables):
-    """Predictions; and of the backbone in training, where alone they differ, the gradients by all parameters."""
     cloud = batch_of(*SCENES)
-    assert_close(run(variables, cloud, TINY), run(variables, cloud, DENSE))
-    voxels = voxelize_batch(cloud, TINY.grid)
-    *outputs, gradients = train_backbone(variables, voxels, TINY)
-    *dense_outputs, dense_gradients = train_backbone(variables, voxels, DENSE)
+    assert_close(run(variables, cloud, TINY), run(variables, cloud, dense(TINY)))
+
+
+def test_backends_agree_in_training(variables):
+    """Of the backbone, where alone they differ: the map, the statistics and the gradients by all parameters."""
+    voxels = small_voxels(300, ROWS)
+    *outputs, gradients = train_backbone(variables, voxels, SMALL)
+    *dense_outputs, dense_gradients = train_backbone(variables, voxels, dense(SMALL))
     assert_close(outputs, dense_outputs)
 
     def assert_close_to_scale(path, mine, reference):
@@ -169,26 +182,31 @@ def test_backends_agree(variables):
 
 
 def test_training_on_an_empty_batch_is_finite(variables):
-    voxels = voxelize_batch(batch_of(*[SCENES[1]] * 4), TINY.grid)
-    outputs, updated, gradients = train_backbone(variables, voxels, TINY)
+    outputs, updated, gradients = train_backbone(variables, small_voxels(0, 0), SMALL)
     chex.assert_tree_all_finite((outputs, gradients))
     jax.tree.map(np.testing.assert_array_equal, updated["batch_stats"], variables["batch_stats"]["backbone"])
 
 
 def test_shifted_voxels_shift_the_bev_map(variables):
     """By one cell (the backbone's stride) along x and two along y; the features stay."""
-    stride, low = TINY.backbone.stride, np.array(TINY.grid.minimum[:2])
-    scenes = [points.copy() for points in SCENES]
-    for points in scenes:
-        points[:, :2] = np.array([3.2, -3.2]) + 0.4 * (points[:, :2] - low)
-    voxels = jax.tree.map(np.asarray, voxelize_batch(batch_of(*scenes), TINY.grid))
-    real = np.arange(voxels.coordinates.shape[1])[None] < voxels.count[:, None]
-    shift = np.where(real[..., None], np.array([0, 2 * stride, stride]), 0).astype(np.int32)
-    (bev, *_), *_ = train_backbone(variables, voxels, TINY)
-    (shifted, *_), *_ = train_backbone(variables, voxels._replace(coordinates=voxels.coordinates + shift), TINY)
-    assert bev.shape == (4, *TINY.bev_shape, TINY.bev_channels)
-    assert bev[0].any(-1).sum() > 50
-    assert_close(shifted[:, 2:, 1:], bev[:, :-2, :-1])
+    stride, voxels = SMALL.backbone.stride, small_voxels(300, ROWS)
+    _, rows, columns = SMALL.grid.shape
+    # The voxels of the middle, moved together to be a scene of their own.
+    middle = np.array([0, rows // 4, columns // 4])
+    coordinates = middle + voxels.coordinates // np.array([1, 2, 2])
+    scenes = [np.unique(c[:n], axis=0) for c, n in zip(coordinates, voxels.count, strict=True)]
+    scenes = [c[np.lexsort(c[:, [0, 2, 1]].T)] for c in scenes]
+    counts = np.array([len(c) for c in scenes], np.int32)
+    padded = np.stack([np.pad(c, ((0, voxels.coordinates.shape[1] - len(c)), (0, 0))) for c in scenes])
+    real = (np.arange(padded.shape[1])[None] < counts[:, None])[..., None]
+    maps = []
+    for shift in (0, stride):
+        moved = np.where(real, padded + shift * np.array([0, 2, 1]), 0).astype(np.int32)
+        (bev, *_), *_ = train_backbone(variables, voxels._replace(coordinates=moved, count=counts), SMALL)
+        maps.append(np.asarray(bev))
+    assert maps[0].shape == (2, *SMALL.bev_shape, SMALL.bev_channels)
+    assert maps[0].any(-1).sum() > 50
+    assert_close(maps[1][:, 2:, 1:], maps[0][:, :-2, :-1])
 
 
 def equations(jaxpr):
