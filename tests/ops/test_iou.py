@@ -133,7 +133,9 @@ def test_a_common_rigid_motion_changes_nothing(seed, angle, shift):
     a, b = random_pairs(np.random.default_rng(seed), 500)
     after = moved(a, angle, shift), moved(b, angle, shift)
     np.testing.assert_allclose(in_float64(*after), in_float64(a, b), rtol=0, atol=FLOAT64)
-    np.testing.assert_allclose(in_float32(*after), in_float32(a, b), rtol=0, atol=FLOAT32)
+    # Rounding 100 m to float32 moves a thin box by more than the tolerance: compare what is left after it.
+    after = rounded(*after)
+    np.testing.assert_allclose(in_float32(*after), in_float64(*after), rtol=0, atol=FLOAT32)
 
 
 def test_the_same_rectangle_written_differently_has_overlap_one():

@@ -28,6 +28,9 @@ from ciassd_jax.ops.nms import (
 )
 from ciassd_jax.types import Boxes, Candidates
 
+# One worker, so that nothing is compiled twice.
+pytestmark = pytest.mark.xdist_group("nms")
+
 SETTINGS = {"overlap": 0.3, "sigma_squared": (0.0009, 0.009, 0.1, 1.0), "distances": (20.0, 40.0, 60.0)}
 SLOTS = 64
 
@@ -231,40 +234,55 @@ def test_pairwise_overlap_across_tiles(slots):
 # Plain rotated NMS
 
 
-def boxes_in_a_row(x: list[float]) -> Boxes:
-    """Boxes of 3 x 2 m along the x axis: with a shift of 1 the IoU is exactly 1 / 2, with 3 it is 0."""
-    boxes = np.zeros((len(x), 7), np.float32)
-    boxes[:, 0], boxes[:, 3:6] = x, (3, 2, 1)
-    return Boxes.from_array(jnp.asarray(boxes))
+ROW = 7
 
 
-def row_of_candidates(x: list[float], label: list[int] | None = None, valid: list[bool] | None = None) -> Candidates:
+def row_of_candidates(x: list[float], label: list[int] | None = None) -> Candidates:
+    """Boxes of 3 x 2 m along the x axis, padded to seven: IoU is exactly 1 / 2 at a shift of 1, 0 at 3."""
     number = len(x)
-    return Candidates(
-        boxes=boxes_in_a_row(x),
-        score=jnp.linspace(0.9, 0.5, number),
-        iou=jnp.ones(number),
-        anchor_distance=jnp.zeros(number),
-        direction=jnp.arange(number, dtype=jnp.int32),
-        label=jnp.array(label or [0] * number, jnp.int32),
-        valid=jnp.array(valid or [True] * number),
+    boxes = np.zeros((ROW, 7), np.float32)
+    boxes[:number, 0], boxes[:, 3:6] = x, (3, 2, 1)
+    candidates = Candidates(
+        boxes=Boxes.from_array(boxes),
+        score=np.linspace(0.9, 0.5, ROW, dtype=np.float32),
+        iou=np.ones(ROW, np.float32),
+        anchor_distance=np.zeros(ROW, np.float32),
+        direction=np.arange(ROW, dtype=np.int32),
+        label=np.array((label or []) + [0] * (ROW - len(label or [])), np.int32),
+        valid=np.arange(ROW) < number,
     )
+    return jax.tree.map(jnp.asarray, candidates)
+
+
+def chosen(clusters: Clusters) -> list[int]:
+    """The slots selected."""
+    return np.flatnonzero(clusters.selected).tolist()
+
+
+@jax.jit
+def rotated(candidates: Candidates) -> dict[str, Clusters]:
+    return {
+        "at 1/2": rotated_nms(candidates, overlap=0.5),
+        "above 1/2": rotated_nms(candidates, overlap=0.50001),
+        "first three": rotated_nms(candidates, overlap=0.5, limit=3),
+        "none": rotated_nms(candidates, overlap=0.5, limit=0),
+    }
 
 
 def test_rotated_nms_suppresses_at_the_limit_itself():
-    candidates = row_of_candidates([10, 11, 13.5])
-    assert rotated_nms(candidates, overlap=0.5).selected.tolist() == [True, False, True]
-    assert rotated_nms(candidates, overlap=0.50001).selected.tolist() == [True, True, True]
+    found = rotated(row_of_candidates([10, 11, 13.5]))
+    assert chosen(found["at 1/2"]) == [0, 2]
+    assert chosen(found["above 1/2"]) == [0, 1, 2]
 
 
 def test_rotated_nms_knows_classes_padding_and_a_limit():
-    candidates = row_of_candidates([10, 10, 10, 20, 30, 40], [0, 1, 0, 0, 0, 0], [True] * 5 + [False])
-    selected = partial(rotated_nms, candidates, overlap=0.3)
-    assert selected().selected.tolist() == [True, True, False, True, True, False]
-    assert selected(limit=3).selected.tolist() == [True, True, False, True, False, False]
-    assert selected(limit=0).selected.tolist() == [False] * 6
-    np.testing.assert_array_equal(selected().boxes.to_array(), candidates.boxes.to_array())
-    np.testing.assert_array_equal(selected().score, candidates.score)
+    candidates = row_of_candidates([10, 10, 10, 20, 30], [0, 1, 0, 0, 0])
+    found = rotated(candidates)
+    assert chosen(found["at 1/2"]) == [0, 1, 3, 4]
+    assert chosen(found["first three"]) == [0, 1, 3]
+    assert chosen(found["none"]) == []
+    np.testing.assert_array_equal(found["at 1/2"].boxes.to_array(), candidates.boxes.to_array())
+    np.testing.assert_array_equal(found["at 1/2"].score, candidates.score)
 
 
 # DI-NMS against the loops
@@ -385,20 +403,20 @@ def test_an_overlap_at_the_limit_itself():
     At 45 m, where the Gaussian would give the other box a weight of exp(-2.5).
     """
     candidates = row_of_candidates([45, 46])
-    thresholds = jnp.full(2, 0.1)
+    thresholds = jnp.full(ROW, 0.1)
     _, released = run_released(candidates, thresholds, overlap=0.5)
-    assert released.selected.tolist() == [True, False]
+    assert chosen(released) == [0]
     np.testing.assert_allclose(released.boxes.center[0], [45, 0, 0])
     _, paper = run_paper(candidates, thresholds, overlap=0.5)
-    assert paper.selected.tolist() == [True, True]
-    np.testing.assert_allclose(paper.boxes.center[:, 0], [45, 46])
+    assert chosen(paper) == [0, 1]
+    np.testing.assert_allclose(paper.boxes.center[:2, 0], [45, 46])
 
 
 def test_support_must_exceed_the_threshold():
     candidates = row_of_candidates([10, 10])
     for run in (run_released, run_paper):
-        assert not run(candidates, jnp.full(2, 2.0))[1].selected.any()
-        assert run(candidates, jnp.full(2, 1.9999))[1].selected.tolist() == [True, False]
+        assert chosen(run(candidates, jnp.full(ROW, 2.0))[1]) == []
+        assert chosen(run(candidates, jnp.full(ROW, 1.9999))[1]) == [0]
 
 
 def test_a_freed_cluster_may_come_again():
@@ -407,17 +425,17 @@ def test_a_freed_cluster_may_come_again():
     IoU 1/2 between neighbours 1 m apart, 1/5 at 2 m: the outer box is supported by 1.7, the middle by 2.
     """
     candidates = row_of_candidates([10, 11, 12])
-    thresholds = jnp.full(3, 1.8)
-    assert run_released(candidates, thresholds)[1].selected.tolist() == [False, True, False]
-    assert not run_paper(candidates, thresholds)[1].selected.any()
+    thresholds = jnp.full(ROW, 1.8)
+    assert chosen(run_released(candidates, thresholds)[1]) == [1]
+    assert chosen(run_paper(candidates, thresholds)[1]) == []
 
 
 def test_average_of_yaws_half_a_turn_apart():
     """Released averages the numbers; the paper's preset aligns them modulo pi first."""
     candidates = row_of_candidates([10, 10, 10])
-    yaw = jnp.array([0.1, 0.1 + np.pi, 0.1 - 3 * np.pi], jnp.float32)
+    yaw = jnp.array([0.1, 0.1 + np.pi, 0.1 - 3 * np.pi, 0, 0, 0, 0], jnp.float32)
     candidates = candidates._replace(boxes=candidates.boxes._replace(yaw=yaw))
-    thresholds = jnp.full(3, 2.6)
+    thresholds = jnp.full(ROW, 2.6)
     np.testing.assert_allclose(run_paper(candidates, thresholds)[1].boxes.yaw[0], 0.1, atol=1e-5)
     np.testing.assert_allclose(run_released(candidates, thresholds)[1].boxes.yaw[0], 0.1 - 2 * np.pi / 3, atol=1e-4)
 
@@ -425,43 +443,43 @@ def test_average_of_yaws_half_a_turn_apart():
 def test_beyond_the_last_distance():
     """The released code has no weight there, the paper a fourth sigma."""
     candidates = row_of_candidates([65, 65, 65])
-    thresholds = jnp.full(3, 2.6)
-    assert not run_released(candidates, thresholds)[1].selected.any()
+    thresholds = jnp.full(ROW, 2.6)
+    assert chosen(run_released(candidates, thresholds)[1]) == []
     _, paper = run_paper(candidates, thresholds)
-    assert paper.selected.tolist() == [True, False, False]
+    assert chosen(paper) == [0]
     np.testing.assert_allclose(paper.boxes.center[0], [65, 0, 0], atol=1e-5)
 
 
 def test_refined_score_orders_the_candidates():
-    candidates = row_of_candidates([10, 20, 30, 40], valid=[True, True, True, False])
-    distance = np.array([1.5, 0.2, 0.1, 50.0])
+    candidates = row_of_candidates([10, 20, 30])
+    distance = np.array([1.5, 0.2, 0.1, 50.0, 50.0, 50.0, 50.0])
     refined = refine_by_anchor_distance(candidates._replace(anchor_distance=jnp.asarray(distance)))
     expected = refined_score(np.asarray(candidates.score, np.float64)[:3], distance[:3])
     order = np.argsort(-expected)
     assert order.tolist() != [0, 1, 2]
-    assert refined.direction.tolist() == [*order.tolist(), 3]
+    assert refined.direction.tolist() == [*order.tolist(), 3, 4, 5, 6]
     np.testing.assert_allclose(refined.score[:3], expected[order], rtol=0, atol=1e-6)
-    assert refined.valid.tolist() == [True, True, True, False]
+    assert refined.valid.tolist() == [True] * 3 + [False] * 4
 
 
 @pytest.mark.parametrize("run", [run_released, run_paper])
 def test_far_anchors_do_not_overflow(run):
     """The softmax of 20 m squared overflows float32 unless it is shifted."""
     candidates = row_of_candidates([10, 10, 10, 30, 30, 30])
-    candidates = candidates._replace(anchor_distance=jnp.array([20.0, 0, 0, 19, 0, 0]))
-    _, clusters = run(candidates, jnp.full(6, 2.6))
-    assert clusters.selected.sum() == 2
-    scores = np.asarray(clusters.score)[np.asarray(clusters.selected)]
+    candidates = candidates._replace(anchor_distance=jnp.array([20.0, 0, 0, 19, 0, 0, 0]))
+    _, clusters = run(candidates, jnp.full(ROW, 2.6))
+    assert len(chosen(clusters)) == 2
+    scores = np.asarray(clusters.score)[chosen(clusters)]
     assert np.isfinite(scores).all()
     assert (scores > 0.5).all()
 
 
 @pytest.mark.parametrize("run", [run_released, run_paper])
 def test_no_candidate_gives_no_cluster(run):
-    candidates = row_of_candidates([10, 20], valid=[False, False])
-    candidates = candidates._replace(score=jnp.full(2, np.nan), anchor_distance=jnp.full(2, np.nan))
-    _, clusters = run(candidates, jnp.zeros(2))
-    assert not clusters.selected.any()
+    candidates = row_of_candidates([])
+    candidates = candidates._replace(score=jnp.full(ROW, np.nan), anchor_distance=jnp.full(ROW, np.nan))
+    _, clusters = run(candidates, jnp.zeros(ROW))
+    assert chosen(clusters) == []
     assert np.isfinite(clusters.boxes.to_array()).all()
 
 
@@ -469,15 +487,15 @@ def test_no_candidate_gives_no_cluster(run):
 def test_a_candidate_that_overflowed_spoils_no_other(run):
     """A real candidate whose size or angle is no number overlaps nothing and is not selected."""
     x = [10.0, 10, 10, 30, 30, 30]
-    sane = run(row_of_candidates([*x, 50]), jnp.full(7, 2.6))[1]
-    assert sane.selected.sum() == 2
+    sane = run(row_of_candidates([*x, 50]), jnp.full(ROW, 2.6))[1]
+    rows = chosen(sane)
+    assert len(rows) == 2
     for broken in (np.inf, np.nan):
         candidates = row_of_candidates([*x, 50])
         boxes = candidates.boxes.to_array().at[6].set(broken)
-        _, clusters = run(candidates._replace(boxes=Boxes.from_array(boxes)), jnp.full(7, 2.6))
-        np.testing.assert_array_equal(clusters.selected, sane.selected)
-        chosen = np.asarray(sane.selected)
-        np.testing.assert_array_equal(clusters.boxes.to_array()[chosen], sane.boxes.to_array()[chosen])
+        _, clusters = run(candidates._replace(boxes=Boxes.from_array(boxes)), jnp.full(ROW, 2.6))
+        assert chosen(clusters) == rows
+        np.testing.assert_array_equal(clusters.boxes.to_array()[np.array(rows)], sane.boxes.to_array()[np.array(rows)])
 
 
 # SPEC A.1: x y z w l h r, f, q, xa ya, direction
