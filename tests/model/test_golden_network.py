@@ -9,16 +9,35 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ciassd_jax.config import HeadConfig
+from ciassd_jax.config import HeadConfig, car_released
 from ciassd_jax.model.detector import CIASSD
 from ciassd_jax.model.head import MultiTaskHead
 from ciassd_jax.ops import boxes as box_ops
+from ciassd_jax.ops import sparse
 from ciassd_jax.ops.camera import frustum_planes
-from ciassd_jax.ops.sparse import linear_keys
+from ciassd_jax.ops.sparse import NO_SITE, coordinates_of, linear_keys
 from ciassd_jax.prediction import RawPredictions, postprocess, voxelize_batch
-from ciassd_jax.types import PointCloud
+from ciassd_jax.types import PointCloud, Sites
 from ciassd_jax.weights import load_weights
 
+# Our names of the 14 sparse layers, in the order of the released code, and the resolution of each.
+LAYERS = {
+    "stage0_0": 0,
+    "stage0_1": 0,
+    "stage1_down": 1,
+    "stage1_0": 1,
+    "stage1_1": 1,
+    "stage2_down": 2,
+    "stage2_0": 2,
+    "stage2_1": 2,
+    "stage2_2": 2,
+    "stage3_down": 3,
+    "stage3_0": 3,
+    "stage3_1": 3,
+    "stage3_2": 3,
+    "out": 4,
+}
+OUT_WINDOW = {"kernel": (3, 1, 1), "stride": (2, 1, 1), "padding": (0, 0, 0)}
 FRAMES = ("000010", "000068", "000095")
 pytestmark = [pytest.mark.reference, pytest.mark.xdist_group("golden_network")]
 
@@ -30,7 +49,9 @@ def network(shared: Path):
 
     @jax.jit
     def run(variables, voxels):
-        keep = lambda module, _: module.name in ("backbone", "neck", "stage0_0", "stage1_down", "stage3_2", "out")  # noqa: E731
+        def keep(module, _):
+            return module.path[:1] == ("backbone",) or module.path == ("neck",)
+
         return CIASSD(weights.config).apply(variables, voxels, capture_intermediates=keep, mutable=["intermediates"])
 
     return weights, run
@@ -49,6 +70,22 @@ def result(shared: Path, frame: str):
     return cloud, voxels, output, kept["intermediates"]
 
 
+@jax.jit
+def strided_sites(voxels):
+    """Sites of the first scene at every resolution."""
+    config = car_released()
+    backbone, shapes = config.backbone, config.backbone.stage_shapes(config.grid.shape)
+    keys = linear_keys(voxels.coordinates[0], shapes[0])
+    sites = [Sites(jnp.where(jnp.arange(keys.shape[0]) < voxels.count[0], keys, NO_SITE), voxels.count[0])]
+    for i, stage in enumerate((*backbone.stages[1:], None)):
+        window = {"kernel": (3, 3, 3), "stride": (2, 2, 2), "padding": (stage.z_padding, 1, 1)} if stage else OUT_WINDOW
+        capacity = stage.capacity if stage else backbone.out_capacity
+        sites.append(
+            sparse.strided_sites(sites[-1], shape=shapes[i], out_shape=shapes[i + 1], capacity=capacity, **window)[0]
+        )
+    return sites
+
+
 @pytest.fixture(scope="module")
 def golden(shared: Path) -> dict[str, np.ndarray]:
     return dict(np.load(shared / "golden" / "network.npz"))
@@ -61,6 +98,12 @@ def test_active_sites(shared: Path, golden: dict, frame: str) -> None:
     assert int(voxels.count[0]) == counts[0]
     np.testing.assert_array_equal(kept[0], counts[[2, 5, 9, 13]])
     assert int(dropped.sum()) == 0
+    sites = strided_sites(voxels)
+    np.testing.assert_array_equal([sites[resolution].count for resolution in LAYERS.values()], counts)
+    z, y, x = np.asarray(coordinates_of(sites[-1].keys, (2, 200, 176)))[: counts[-1]].T
+    active = np.zeros((2, 200, 176), bool)
+    active[z, y, x] = True
+    np.testing.assert_array_equal(np.packbits(active), golden[f"{frame}_bev_active_bits"])
 
 
 @pytest.mark.parametrize("frame", FRAMES)
@@ -75,16 +118,26 @@ def test_bev_map(shared: Path, golden: dict, frame: str) -> None:
     assert not by_layer[:, ~active].any()
 
 
-def test_sampled_layers(shared: Path, golden: dict) -> None:
+def test_every_sparse_layer(shared: Path, golden: dict) -> None:
+    """At sampled sites, before and behind the ReLU, and summed over all sites."""
     _, voxels, _, kept = result(shared, "000010")
-    at = golden["000010_stage00_coords"].astype(np.int32)
-    keys = np.asarray(linear_keys(voxels.coordinates[0], (41, 1600, 1408)))[: int(voxels.count[0])]
-    rows = np.searchsorted(keys, np.asarray(linear_keys(jnp.asarray(at), (41, 1600, 1408))))
-    features = np.asarray(kept["backbone"]["stage0_0"]["__call__"][0])
-    np.testing.assert_allclose(features[rows], golden["000010_stage00_act"], rtol=0, atol=1e-4)
-    for layer, stage in (("stage0_0", "00"), ("stage1_down", "06"), ("stage3_2", "36"), ("out", "39")):
-        total = np.asarray(kept["backbone"][layer]["__call__"][0]).sum(0, dtype=float)
-        np.testing.assert_allclose(total, golden[f"000010_stage{stage}_act_channel_sum"], rtol=1e-5, atol=1e-2)
+    variables, config = network(shared)[0][:2]
+    sites, shapes = strided_sites(voxels), config.backbone.stage_shapes(config.grid.shape)
+    for number, (layer, resolution) in enumerate(LAYERS.items()):
+        name = f"000010_stage{3 * number:02d}"
+        wanted = linear_keys(jnp.asarray(golden[f"{name}_coords"], jnp.int32), shapes[resolution])
+        rows = np.searchsorted(sites[resolution].keys, wanted)
+        np.testing.assert_array_equal(sites[resolution].keys[rows], wanted)
+        norm, statistics = (variables[kind]["backbone"][layer]["norm"] for kind in ("params", "batch_stats"))
+        factor = norm["scale"] / np.sqrt(statistics["var"] + 1e-3)
+        normalized = (golden[f"{name}_conv"] - statistics["mean"]) * factor + norm["bias"]
+        ours = kept["backbone"][layer]
+        np.testing.assert_allclose(ours["norm"]["__call__"][0][rows], normalized, rtol=0, atol=1e-4, err_msg=layer)
+        activated = np.asarray(ours["__call__"][0])
+        np.testing.assert_allclose(activated[rows], golden[f"{name}_act"], rtol=0, atol=1e-4, err_msg=layer)
+        np.testing.assert_allclose(
+            activated.sum(0, dtype=float), golden[f"{name}_act_channel_sum"], rtol=1e-5, atol=1e-2, err_msg=layer
+        )
 
 
 @pytest.mark.parametrize("frame", FRAMES)
