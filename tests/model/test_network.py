@@ -220,18 +220,29 @@ def equations(jaxpr):
                     yield from equations(inner)
 
 
-def test_the_car_never_holds_a_dense_grid():
-    """No array of a whole 3D grid at any stage but the BEV map's, in any branch for any platform."""
+@pytest.fixture(scope="module")
+def car_equations() -> list:
+    """Everything that `predict` computes for the car, in any branch for any platform."""
     config = presets.car()
     cloud = PointCloud(jax.ShapeDtypeStruct((1, 32768, 4), np.float32), jax.ShapeDtypeStruct((1,), np.int32))
-    jaxpr = jax.make_jaxpr(partial(predict, config=config))(shapes_of(config), cloud)
-    found = list(equations(jaxpr.jaxpr))
-    # The walk reaches the products inside of the loop over blocks.
-    names = {equation.primitive.name for equation in found}
-    assert {"while", "dot_general", "conv_general_dilated"} <= names
-    shapes = {tuple(variable.aval.shape) for equation in found for variable in equation.outvars}
-    assert max(np.prod(shape, dtype=int) for shape in shapes) < 64 * 2**20
+    found = list(equations(jax.make_jaxpr(partial(predict, config=config))(shapes_of(config), cloud).jaxpr))
+    # The walk reaches the products inside of the loops over blocks.
+    assert {"while", "dot_general", "conv_general_dilated"} <= {equation.primitive.name for equation in found}
+    return found
+
+
+def test_the_car_never_holds_a_dense_grid(car_equations):
+    """No array is as large as a 3D grid of any stage but the BEV map's, whatever its channels."""
+    config = presets.car()
+    sizes = {np.prod(variable.aval.shape, dtype=int) for equation in car_equations for variable in equation.outvars}
+    assert max(sizes) < 64 * 2**20
     for grid in config.backbone.stage_shapes(config.grid.shape)[:-1]:
         cells = np.prod(grid, dtype=int)
-        channels = {1, 3, 4, 16, 27, 32, 64}
-        assert not [shape for shape in shapes if np.prod(shape, dtype=int) in {cells * c for c in channels}], grid
+        assert not sizes & {cells * channels for channels in (1, 3, 4, 16, 27, 32, 64)}, grid
+
+
+def test_every_product_asks_for_full_precision(car_equations):
+    """Accelerators would otherwise use TF32 or bfloat16."""
+    products = [e for e in car_equations if e.primitive.name in ("dot_general", "conv_general_dilated")]
+    for equation in products:
+        assert equation.params["precision"] == (jax.lax.Precision.HIGHEST,) * 2, equation
