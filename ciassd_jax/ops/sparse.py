@@ -1,9 +1,9 @@
 """Sparse 3D convolution with static shapes (paper section 3.1, SPEC section 4).
 
 A scene is a grid (z, y, x) in which only active sites exist. Sites are sorted by linear key with z fastest, so
-that the z neighbours of a column are adjacent and one binary search serves a kernel's whole z extent. A
-neighbour table says which input each kernel offset reads; a convolution is a gather through it and one matrix
-product, in value and in gradient. `sparse_dense.py` holds the definition that this must equal.
+that the sites of a BEV column are adjacent; a map of the columns finds any of them in constant time. A neighbour
+table says which input each kernel offset reads; a convolution is a gather through it and one matrix product for
+each block of rows, in value and in gradient. `sparse_dense.py` holds the definition that this must equal.
 """
 
 from __future__ import annotations
