@@ -22,7 +22,8 @@ from released import released_state, write_pth
 from small import CALIBRATION, IMAGE_SIZE, random_variables, share_programs, small_cloud, small_config
 
 from ciassd_jax import Detector, load_weights, save_weights, tiny
-from ciassd_jax.cli import Preset, main
+from ciassd_jax.cli import main
+from ciassd_jax.cli.inference import Preset
 from ciassd_jax.config import PRESETS
 from ciassd_jax.detector import FrameResult
 from ciassd_jax.formats.kitti import read_rows

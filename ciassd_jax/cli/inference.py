@@ -1,24 +1,18 @@
-"""The program `ciassd`: every sub-command is a thin call of public functions.
-
-Exit codes: 0 good, 1 failed check, 2 bad usage or input (one sentence on stderr says what and the remedy).
-"""
+"""Commands around a network with its weights: predict, convert, info, demo."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import sys
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from ciassd_jax.cli.messages import UsageError, warnings_as_lines
 from ciassd_jax.config import PRESETS, Config
-from ciassd_jax.formats.errors import FormatError, FormatWarning
+from ciassd_jax.formats.errors import FormatError
 
 if TYPE_CHECKING:
     from ciassd_jax.detector import Detector, FrameResult
@@ -26,10 +20,6 @@ if TYPE_CHECKING:
     from ciassd_jax.weights import Weights
 
 Preset = Literal["car", "car_released", "car_lite", "three_class", "tiny"]
-
-
-class UsageError(ValueError):
-    """An option cannot be used; the message is one sentence that says what would be valid."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +64,7 @@ class Predict:
     def _frame(self, detector: Detector, frame: Frame) -> tuple[FrameResult, list[Path]]:
         from ciassd_jax.predict_files import detect_frame, write_frame
 
-        with _warnings_as_lines(frame.cloud):
+        with warnings_as_lines(frame.cloud):
             result = detect_frame(detector, frame)
             return result, write_frame(frame, result, self.out)
 
@@ -174,28 +164,10 @@ class Demo:
     def run(self) -> int:
         from ciassd_jax.demo import run_demo
 
-        with _warnings_as_lines(self.file or "synthetic scene"):
+        with warnings_as_lines(self.file or "synthetic scene"):
             weights = _load(self.weights, None) if self.weights else None
             run_demo(self.file, weights, self.out)
         return 0
-
-
-Command = (
-    Annotated[Predict, tyro.conf.subcommand("predict")]
-    | Annotated[Convert, tyro.conf.subcommand("convert")]
-    | Annotated[Info, tyro.conf.subcommand("info")]
-    | Annotated[Demo, tyro.conf.subcommand("demo")]
-)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; returns the exit code."""
-    command = tyro.cli(Command, prog="ciassd", args=arguments, description="LiDAR 3D object detection in JAX.")
-    try:
-        return command.run()
-    except (FormatError, UsageError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
 
 
 def _load(path: Path, preset: str | None) -> Weights:
@@ -230,25 +202,3 @@ def _table(result: FrameResult) -> str:
     for label, score, box in zip(result.labels, result.scores, result.boxes, strict=True):
         rows.append(f"  {label:<10} {score:>6.3f} " + " ".join(f"{value:>7.2f}" for value in box))
     return "\n".join(rows)
-
-
-@contextmanager
-def _warnings_as_lines(source: Path | str) -> Iterator[None]:
-    """Show our own warnings as one line that names the input; leave all others as they are."""
-    from tqdm.auto import tqdm
-
-    from ciassd_jax.detector import DroppedWarning
-
-    def show(message, category, *rest, **more):  # type: ignore[no-untyped-def]
-        if issubclass(category, DroppedWarning | FormatWarning):
-            named = message if issubclass(category, FormatWarning) else f"{source}: {message}"
-            tqdm.write(f"warning: {named}", file=sys.stderr)
-        else:
-            before(message, category, *rest, **more)
-
-    before = warnings.showwarning
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", DroppedWarning)
-        warnings.simplefilter("always", FormatWarning)
-        warnings.showwarning = show
-        yield

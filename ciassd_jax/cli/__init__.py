@@ -1,0 +1,33 @@
+"""The program `ciassd`: every sub-command is a thin call of public functions.
+
+Exit codes: 0 good, 1 failed check, 2 bad usage or input (one sentence on stderr says what and the remedy).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from ciassd_jax.cli.inference import Convert, Demo, Info, Predict
+from ciassd_jax.cli.messages import UsageError
+from ciassd_jax.formats.errors import FormatError
+
+Command = (
+    Annotated[Predict, tyro.conf.subcommand("predict")]
+    | Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns the exit code."""
+    command = tyro.cli(Command, prog="ciassd", args=arguments, description="LiDAR 3D object detection in JAX.")
+    try:
+        return command.run()
+    except (FormatError, UsageError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
