@@ -1,9 +1,10 @@
 """LiDAR 3D object detection in JAX: CIA-SSD as pure functions with fixed shapes."""
 
-from ciassd_jax.config import Config, car, car_lite, car_released, three_class, tiny
+from ciassd_jax.config import Config
 from ciassd_jax.detector import Detector
 from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import predict
+from ciassd_jax.presets import car, car_lite, car_released, three_class, tiny
 from ciassd_jax.types import Boxes, Detections, PointCloud
 from ciassd_jax.weights import load_weights, save_weights
 

@@ -1,4 +1,4 @@
-"""What a detector is, as frozen dataclasses of numbers and tuples, and the named presets.
+"""What a detector is, as frozen dataclasses of numbers and tuples; `presets.py` has the named ones.
 
 A config is hashable (a static argument of jit), says why a value is refused, and round-trips through JSON.
 """
@@ -10,8 +10,7 @@ import json
 import math
 import types
 import typing
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 
@@ -146,12 +145,66 @@ class ClassConfig:
     unmatched: float = 0.45
     # A detection needs this much IoU-weighted support (mu of Algorithm 1).
     support_threshold: float = 2.6
+    # Label names that count as this class in training (paper section 4.1: vans are cars).
+    similar: tuple[str, ...] = ()
+    # Objects are pasted until a scene holds so many of this name, none for 0 (SPEC section 2.3).
+    paste_up_to: int = 0
+    # A database object needs so many points.
+    paste_min_points: int = 5
 
     def __post_init__(self) -> None:
         if min(self.width, self.length, self.height) <= 0:
             raise ValueError(f"class {self.name}: width, length and height must be positive.")
         if not 0 < self.unmatched <= self.matched <= 1:
             raise ValueError(f"class {self.name}: thresholds must satisfy 0 < unmatched <= matched <= 1.")
+        if self.paste_up_to < 0 or self.paste_min_points < 1:
+            raise ValueError(f"class {self.name}: paste_up_to must be at least 0 and paste_min_points at least 1.")
+
+
+CAR = ClassConfig(similar=("Van",), paste_up_to=15)
+
+
+@dataclass(frozen=True)
+class AugmentationConfig:
+    """The five switches of the paper's Table 3, and their numbers (paper section 4.1, SPEC section 2)."""
+
+    global_transform: bool = True
+    object_noise: bool = True
+    paste: bool = True
+    similar_classes: bool = True
+    # Objects harder than hard stay out of the database; `filter_scenes` leaves them out of the scenes too.
+    difficulty_filter: bool = True
+    filter_scenes: bool = False
+    flip_probability: float = 0.5
+    max_rotation: float = 0.785
+    min_scale: float = 0.95
+    max_scale: float = 1.05
+    # Standard deviation of an object's shift in metres, its largest turn in radians, and the tries it has.
+    noise_shift: tuple[float, float, float] = (1.0, 1.0, 0.5)
+    noise_rotation: float = 0.785
+    noise_tries: int = 100
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.flip_probability <= 1:
+            raise ValueError(f"augmentation.flip_probability: {self.flip_probability} is outside [0, 1].")
+        if not 0 < self.min_scale <= self.max_scale:
+            raise ValueError("augmentation: scales must satisfy 0 < min_scale <= max_scale.")
+        if min(self.max_rotation, self.noise_rotation, *self.noise_shift) < 0 or self.noise_tries < 1:
+            raise ValueError("augmentation: rotations and shifts must be at least 0, noise_tries at least 1.")
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Capacities of a labelled scene, and its augmentation."""
+
+    max_points: int = 32768
+    max_boxes: int = 64
+    max_paste_points: int = 16384
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+
+    def __post_init__(self) -> None:
+        if min(self.max_points, self.max_boxes, self.max_paste_points) < 1:
+            raise ValueError("data: max_points, max_boxes and max_paste_points must be at least 1.")
 
 
 @dataclass(frozen=True)
@@ -200,9 +253,10 @@ class Config:
     grid: GridConfig = field(default_factory=GridConfig)
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     neck: NeckConfig = field(default_factory=NeckConfig)
-    classes: tuple[ClassConfig, ...] = (ClassConfig(),)
+    classes: tuple[ClassConfig, ...] = (CAR,)
     head: HeadConfig = field(default_factory=HeadConfig)
     detection: DetectionConfig = field(default_factory=DetectionConfig)
+    data: DataConfig = field(default_factory=DataConfig)
     # Compute type of the network; parameters, BatchNorm, coordinates, IoU and NMS stay float32.
     dtype: Literal["float32", "bfloat16"] = "float32"
 
@@ -298,83 +352,3 @@ def _build(kind: Any, data: Any, where: str) -> Any:
     if type(data) is not kind:
         raise ValueError(f"{where}: expected {kind.__name__}, not {data!r}.")
     return data
-
-
-def car() -> Config:
-    """The paper's car detector on KITTI, with every open point decided as in the README's table."""
-    return Config()
-
-
-def car_released() -> Config:
-    """The authors' released code, quirks included: with their weights it gives their boxes."""
-    config = car()
-    return replace(
-        config,
-        grid=replace(config.grid, overflow="stop"),
-        neck=replace(config.neck, attention_kernel=1),
-        head=HeadConfig(angles=(0.0, 1.57), iou_kernel=3, iou_bias=False),
-        detection=replace(config.detection, nms="released", clamp_iou=False),
-    )
-
-
-def car_lite() -> Config:
-    """The same method sized for a CPU: about ten frames a second on two cores (benchmarks/README.md).
-
-    Voxels of twice the size quarter the BEV map to cells of 0.8 m, where the neck spends its time, and leave two
-    thirds of the sites. Half the neck's width quarters its arithmetic again. A map of 0.4 m with a neck of 32
-    channels would cost half as much again: convolutions of so few channels run on one core. The second stage, with
-    the most sites, only strides.
-    """
-    return Config(
-        grid=GridConfig(voxel_size=(0.1, 0.1, 0.2), max_voxels=14000),
-        backbone=BackboneConfig(
-            stages=(
-                StageConfig(channels=8, layers=1, capacity=14000),
-                StageConfig(channels=16, layers=0, capacity=18000),
-                StageConfig(channels=32, layers=1, capacity=12000),
-                StageConfig(channels=32, layers=2, capacity=5000),
-            ),
-            out_channels=32,
-            out_capacity=3000,
-        ),
-        neck=NeckConfig(channels=64),
-        detection=DetectionConfig(max_candidates=256),
-    )
-
-
-def three_class() -> Config:
-    """Car, pedestrian and cyclist; not in the paper and not tuned."""
-    small = {"width": 0.6, "center_z": -0.6, "height": 1.73, "matched": 0.5, "unmatched": 0.35}
-    return replace(
-        car(),
-        classes=(
-            ClassConfig(),
-            ClassConfig(name="Pedestrian", length=0.8, support_threshold=1.0, **small),
-            ClassConfig(name="Cyclist", length=1.76, support_threshold=1.0, **small),
-        ),
-    )
-
-
-def tiny() -> Config:
-    """A toy of the same shape for tests and notebooks: 12.8 m x 12.8 m, a few thousand parameters."""
-    return Config(
-        grid=GridConfig(
-            minimum=(0.0, -6.4, -3.0), maximum=(12.8, 6.4, 1.0), voxel_size=(0.1, 0.1, 0.2), max_voxels=2048
-        ),
-        backbone=BackboneConfig(
-            stages=(
-                StageConfig(channels=4, layers=1, capacity=2048),
-                StageConfig(channels=8, layers=1, capacity=2048),
-                StageConfig(channels=8, layers=1, capacity=1024),
-            ),
-            out_channels=8,
-            out_capacity=1024,
-        ),
-        neck=NeckConfig(channels=16),
-        detection=DetectionConfig(max_candidates=128),
-    )
-
-
-PRESETS: dict[str, Callable[[], Config]] = {
-    preset.__name__: preset for preset in (car, car_released, car_lite, three_class, tiny)
-}

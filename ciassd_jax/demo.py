@@ -7,12 +7,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from ciassd_jax.config import car_lite
 from ciassd_jax.detector import BUNDLED, Detector, FrameResult
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.formats.writing import check_folder, replacing
 from ciassd_jax.model.detector import init_variables
 from ciassd_jax.predict_files import write_json
+from ciassd_jax.presets import car_lite
 from ciassd_jax.weights import Weights
 
 UNTRAINED = """No trained weights are bundled yet, so this network is UNTRAINED: its boxes mean nothing.

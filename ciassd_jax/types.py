@@ -4,7 +4,8 @@ Every record is a NamedTuple of arrays. Shapes are given for one scene; a batch 
 leading axis B on every leaf. Padding comes last and is inert.
 
 Letters: B scenes, P points, V voxel or site slots, A anchors, G truth boxes, K candidates, D detections,
-H W cells of the bird's-eye-view (BEV) map, C channels, S strided stages of the backbone.
+H W cells of the bird's-eye-view (BEV) map, C channels, S strided stages of the backbone, N classes, O objects
+that may be pasted and Q their points.
 
 Frame: LiDAR, x forward, y left, z up, metres. Yaw is counter-clockwise from +x, in radians.
 """
@@ -47,6 +48,48 @@ class Boxes(NamedTuple):
         numpy = all(isinstance(leaf, np.ndarray) for leaf in self)
         parts = [self.center, self.size, self.yaw[..., None]]
         return np.concatenate(parts, -1) if numpy else jnp.concatenate(parts, -1)
+
+
+class GroundTruth(NamedTuple):
+    """Labelled boxes of a scene; the first `count` rows are real, the others zero with label -1.
+
+    `label` is the class that a box is a target of (a similar class counts as it), -1 for an object of no class: an
+    obstacle that nothing may be put onto, and no target.
+    """
+
+    boxes: Boxes
+    label: Int[Array, "*b G"]
+    count: Int[Array, "*b"]  # type: ignore[assignment]
+
+
+class Scene(NamedTuple):
+    """A labelled frame, padded: what the loader gives and `train_step` takes.
+
+    `frame` is the frame's place in its data set. `points_cut` and `boxes_cut` count what was over capacity.
+    """
+
+    cloud: PointCloud
+    truth: GroundTruth
+    frame: Int[Array, "*b"]
+    points_cut: Int[Array, "*b"]
+    boxes_cut: Int[Array, "*b"]
+
+
+class PasteObjects(NamedTuple):
+    """Objects drawn from the ground-truth database for one scene, in the LiDAR frame and the order of the draw.
+
+    Slot k holds an object where `valid`: for every class two rounds of as many slots as objects may be wanted. Point
+    q belongs to the object in slot `owner[q]`; padding points have the number of slots there. `wanted` is the
+    number of objects of each class that the scene still lacks, `cut` counts objects whose points did not fit.
+    """
+
+    boxes: Boxes
+    label: Int[Array, "*b O"]
+    valid: Bool[Array, "*b O"]
+    points: Float[Array, "*b Q 4"]
+    owner: Int[Array, "*b Q"]
+    wanted: Int[Array, "*b N"]
+    cut: Int[Array, "*b"]
 
 
 class SparseVoxels(NamedTuple):

@@ -19,11 +19,12 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from ciassd_jax.config import Config, HeadConfig, car_released
+from ciassd_jax.config import Config, HeadConfig
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.formats.torch_file import read_torch_file
 from ciassd_jax.formats.writing import replacing
 from ciassd_jax.model.detector import init_variables
+from ciassd_jax.presets import car_released
 from ciassd_jax.types import Variables
 
 Tensors = Mapping[str, np.ndarray]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ciassd_jax.anchors import make_anchors
-from ciassd_jax.config import HeadConfig, car, car_released, three_class, tiny
+from ciassd_jax.config import HeadConfig
 from ciassd_jax.ops.boxes import to_paper
+from ciassd_jax.presets import car, car_released, three_class, tiny
 
 
 @pytest.mark.reference

@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "ciassd_jax"
 LAYERS = [
-    {"types", "config"},
+    {"types", "config", "presets"},
     {"ops", "formats"},
     {"model", "anchors", "detections"},
     {"prediction", "weights", "detector", "export", "info", "predict_files", "demo", "view", "cli"},

@@ -24,10 +24,10 @@ from small import CALIBRATION, IMAGE_SIZE, random_variables, share_programs, sma
 from ciassd_jax import Detector, load_weights, save_weights, tiny
 from ciassd_jax.cli import main
 from ciassd_jax.cli.inference import Preset
-from ciassd_jax.config import PRESETS
 from ciassd_jax.detector import FrameResult
 from ciassd_jax.formats.kitti import read_rows
 from ciassd_jax.formats.points import write_bin
+from ciassd_jax.presets import PRESETS
 
 pytestmark = pytest.mark.xdist_group("detector")
 

@@ -10,7 +10,6 @@ import jaxtyping
 import pytest
 
 from ciassd_jax.config import (
-    PRESETS,
     BackboneConfig,
     ClassConfig,
     Config,
@@ -19,12 +18,8 @@ from ciassd_jax.config import (
     HeadConfig,
     NeckConfig,
     StageConfig,
-    car,
-    car_lite,
-    car_released,
-    three_class,
-    tiny,
 )
+from ciassd_jax.presets import PRESETS, car, car_lite, car_released, three_class, tiny
 
 presets = pytest.mark.parametrize("make", list(PRESETS.values()), ids=list(PRESETS))
 
@@ -128,7 +123,7 @@ def test_three_classes_add_classes_only():
 @pytest.mark.parametrize("make", [car_lite, tiny])
 def test_small_presets_keep_the_method(make):
     """They resize the grid and the network, and leave the head, the classes and the rules of detection alone."""
-    sizes = re.compile(r"grid\.|backbone\.|neck\.channels|detection\.max_candidates")
+    sizes = re.compile(r"grid\.|backbone\.|neck\.channels|detection\.max_candidates|data\.max_")
     changed = differences(make(), car())
     assert changed
     assert all(sizes.match(path) for path in changed), changed

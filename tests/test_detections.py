@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from oracles import polygon_iou_matrix, released_di_nms_loop
 
-from ciassd_jax.config import Config, car, car_released, three_class
+from ciassd_jax.config import Config
 from ciassd_jax.detections import finish, rectify, select_candidates, suppress
 from ciassd_jax.ops.boxes import encode, from_paper, to_paper
 from ciassd_jax.ops.nms import Clusters, rotated_nms
+from ciassd_jax.presets import car, car_released, three_class
 from ciassd_jax.types import Boxes, Candidates, Predictions
 
 # One worker, so that nothing is compiled twice.

@@ -6,10 +6,10 @@ import jax
 import numpy as np
 from jax import export
 
-from ciassd_jax.config import tiny
 from ciassd_jax.export import PLATFORMS, export_predict, run_exported
 from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import predict
+from ciassd_jax.presets import tiny
 from ciassd_jax.types import PointCloud
 
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
-from ciassd_jax.config import PRESETS, Config
+from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.presets import PRESETS
 
 if TYPE_CHECKING:
     from ciassd_jax.detector import Detector, FrameResult

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ciassd_jax.config import HeadConfig, car_released
+from ciassd_jax.config import HeadConfig
 from ciassd_jax.model.detector import CIASSD
 from ciassd_jax.model.head import MultiTaskHead
 from ciassd_jax.ops import boxes as box_ops
@@ -17,6 +17,7 @@ from ciassd_jax.ops import sparse
 from ciassd_jax.ops.camera import frustum_planes
 from ciassd_jax.ops.sparse import NO_SITE, coordinates_of, linear_keys
 from ciassd_jax.prediction import RawPredictions, postprocess, voxelize_batch
+from ciassd_jax.presets import car_released
 from ciassd_jax.types import PointCloud, Sites
 from ciassd_jax.weights import load_weights
 
