@@ -10,26 +10,11 @@ from typing import NamedTuple
 
 from ciassd_jax.detector import Detector, FrameResult
 from ciassd_jax.formats.errors import FormatError, FormatWarning, Pathlike, read_bytes
-from ciassd_jax.formats.kitti import (
-    Calibration,
-    boxes_to_rows,
-    image_size_for,
-    lidar_to_image,
-    read_calibration,
-    read_png_size,
-    write_rows,
-)
+from ciassd_jax.formats.kitti import boxes_to_rows, write_rows
+from ciassd_jax.formats.kitti_camera import Camera, read_camera, view_planes
 from ciassd_jax.formats.points import POINT_SUFFIXES, read_points
 from ciassd_jax.formats.writing import replacing
-from ciassd_jax.ops.camera import frustum_planes
 from ciassd_jax.types import Boxes
-
-
-class Camera(NamedTuple):
-    """The camera of a frame: its calibration and the (width, height) of its image in pixels."""
-
-    calibration: Calibration
-    image_size: tuple[int, int]
 
 
 class Frame(NamedTuple):
@@ -60,9 +45,7 @@ def detect_frame(detector: Detector, frame: Frame) -> FrameResult:
     points = read_points(frame.cloud)
     if frame.camera is None:
         return detector.detect(points)
-    width, height = frame.camera.image_size
-    planes = frustum_planes(lidar_to_image(frame.camera.calibration), width=width, height=height)
-    return detector.detect(points, frustum=planes)
+    return detector.detect(points, frustum=view_planes(frame.camera))
 
 
 def write_frame(frame: Frame, result: FrameResult, folder: Pathlike) -> list[Path]:
@@ -125,17 +108,7 @@ def _find_camera(cloud: Path, given: Pathlike | None, image_size: tuple[int, int
     path = _find_calibration(cloud, given)
     if path is None:
         return None
-    calibration = read_calibration(path)
-    image = _beside(cloud, "image_2", ".png")
-    if image_size is None and image is not None:
-        image_size = read_png_size(image)
-    size = image_size or image_size_for(calibration)
-    if size is None:
-        raise FormatError(
-            f"{path} has a focal length of {calibration.projection[0, 0]:g} pixels, which is none of KITTI's, so the "
-            "image could be of any size; give it with --image-size WIDTH HEIGHT."
-        )
-    return Camera(calibration, size)
+    return read_camera(path, _beside(cloud, "image_2", ".png"), image_size)
 
 
 def _find_calibration(cloud: Path, given: Pathlike | None) -> Path | None:
