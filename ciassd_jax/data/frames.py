@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 
+from ciassd_jax.formats.errors import FormatWarning, Pathlike
 from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.types import Boxes
 
 
@@ -51,20 +53,20 @@ _POINTS_OF_DIFFICULTY = (50, 20, 5)
 
 def difficulty_by_points(points: Float[np.ndarray, "P C"], boxes: Boxes) -> Int[np.ndarray, " G"]:
     """Difficulty by the number of points inside a box: 0 from 50, 1 from 20, 2 from 5, else -1."""
-    inside = points_inside(points, boxes).sum(-1)
+    inside = points_in_boxes(points, boxes).sum(-1)
     levels = sum((inside >= least).astype(np.int64) for least in _POINTS_OF_DIFFICULTY)
     return np.where(levels > 0, len(_POINTS_OF_DIFFICULTY) - levels, -1)
 
 
-def points_inside(points: Float[np.ndarray, "P C"], boxes: Boxes) -> Bool[np.ndarray, "G P"]:
-    """Which points (x, y, z first) lie strictly inside which box; in float64, false for NaN."""
-    inside = np.zeros((len(boxes.yaw), len(points)), bool)
-    x, y, z = points[:, :3].T.astype(np.float64)
-    for index, (center, half, yaw) in enumerate(zip(boxes.center, boxes.size / 2, boxes.yaw, strict=True)):
-        reach = math.hypot(half[0], half[1])
-        near = np.flatnonzero((np.abs(x - center[0]) < reach) & (np.abs(y - center[1]) < reach))
-        forward, left = x[near] - center[0], y[near] - center[1]
-        along = np.abs(forward * math.cos(yaw) + left * math.sin(yaw)) < half[0]
-        across = np.abs(left * math.cos(yaw) - forward * math.sin(yaw)) < half[1]
-        inside[index, near] = along & across & (np.abs(z[near] - center[2]) < half[2])
-    return inside
+def unit_intensity(points: Float32[np.ndarray, "P 4"], path: Pathlike) -> Float32[np.ndarray, "P 4"]:
+    """The points of a file with intensity in [0, 1]: divided by 255, with a warning, where it exceeds 2."""
+    intensity = points[:, 3]
+    top = intensity.max(initial=0, where=np.isfinite(intensity))
+    if top <= 2:
+        return points
+    warnings.warn(
+        f"{path} has intensities of up to {top:g}; they were divided by 255, as they should lie in [0, 1].",
+        FormatWarning,
+        stacklevel=3,
+    )
+    return np.concatenate([points[:, :3], points[:, 3:] / np.float32(255)], 1)

@@ -1,0 +1,91 @@
+"""KITTI's folders of the object benchmark, read as they were downloaded (SPEC section 1)."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from ciassd_jax.data.frames import Dataset, Frame, unit_intensity
+from ciassd_jax.data.splits import Places, find_file, split_names
+from ciassd_jax.formats.errors import FormatError, FormatWarning
+from ciassd_jax.formats.kitti import ObjectRow, read_rows, rows_to_boxes
+from ciassd_jax.formats.kitti_camera import Camera, read_camera, view_planes
+from ciassd_jax.formats.kitti_difficulty import difficulty_of
+from ciassd_jax.formats.points import read_points
+from ciassd_jax.ops.camera import inside_planes
+
+REDUCED, FULL = "velodyne_reduced/{}.bin", "velodyne/{}.bin"
+IMAGE = "image_2/{}.png"
+PLACES: Places = {"cloud": (REDUCED, FULL), "calibration": ("calib/{}.txt",), "label": ("label_2/{}.txt",)}
+TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
+IGNORED = "DontCare"
+
+
+def open_kitti(root: Path, split: str, image_size: tuple[int, int] | None = None) -> Dataset:
+    """The frames of a split in ROOT/training, of the split "test" in ROOT/testing, which has no labels.
+
+    `split` is train, val, trainval, test, "all", or the name of a file in ROOT/ImageSets. `image_size` (width, height)
+    stands in for the sizes of the images. Warns where full clouds must be cropped to images that are not there.
+    """
+    folder, places = kitti_folder(root, split)
+    names = split_names(root, split, folder, places)
+    if image_size is None:
+        _warn_of_guessed_sizes(folder, names)
+    return Dataset(names, partial(read_kitti_frame, folder=folder, labelled="label" in places, image_size=image_size))
+
+
+def kitti_folder(root: Path, split: str) -> tuple[Path, Places]:
+    """The folder of a split's frames, and the files that each of them has there."""
+    if split != "test":
+        return root / "training", PLACES
+    return root / "testing", {kind: paths for kind, paths in PLACES.items() if kind != "label"}
+
+
+def read_kitti_frame(
+    name: str, *, folder: Path, labelled: bool = True, image_size: tuple[int, int] | None = None
+) -> Frame:
+    """Read one frame; the full cloud is cropped to the camera's view where no reduced one is there.
+
+    Without labels there are no boxes. Raises FormatError for a file that is missing or malformed.
+    """
+    camera = read_camera(folder / f"calib/{name}.txt", folder / IMAGE.format(name), image_size)
+    points = read_seen_points(folder, name, camera)
+    rows = read_objects(folder / f"label_2/{name}.txt") if labelled else []
+    difficulty = np.array([difficulty_of(row) for row in rows], np.int64)
+    boxes = rows_to_boxes(rows, camera.calibration)
+    return Frame(name, points, boxes, tuple(row.type for row in rows), difficulty, camera)
+
+
+def read_objects(path: Path) -> list[ObjectRow]:
+    """The rows of a label file without DontCare."""
+    return [row for row in read_rows(path) if row.type != IGNORED]
+
+
+def read_seen_points(folder: Path, name: str, camera: Camera) -> Float32[np.ndarray, "P 4"]:
+    """The frame's reduced cloud, or its full one cropped to the camera's view."""
+    path = find_file(folder, PLACES["cloud"], name)
+    if path is None:
+        raise FormatError(f"{folder / FULL.format(name)} does not exist; copy it, or take the frame off the split.")
+    points = unit_intensity(read_points(path), path)
+    return points if path == folder / REDUCED.format(name) else crop_to_view(points, camera)
+
+
+def crop_to_view(points: Float32[np.ndarray, "N 4"], camera: Camera) -> Float32[np.ndarray, "P 4"]:
+    """The points that the camera sees, strictly inside the image and nearer than 100 m (SPEC 1.3)."""
+    return points[inside_planes(points[:, :3].astype(np.float64), view_planes(camera))]
+
+
+def _warn_of_guessed_sizes(folder: Path, names: tuple[str, ...]) -> None:
+    """Say how many clouds would be cropped to an image whose size is only known from the focal length."""
+    guessed = sum(not any((folder / path.format(name)).is_file() for path in (REDUCED, IMAGE)) for name in names)
+    if guessed:
+        warnings.warn(
+            f"{folder / IMAGE.format('NAME')} is missing for {guessed} of {len(names)} frames whose clouds are cropped "
+            "to the image; the usual size for the camera's focal length is used instead.",
+            FormatWarning,
+            stacklevel=4,
+        )

@@ -1,0 +1,119 @@
+"""Which frames a split names, and whether their files are there."""
+
+from __future__ import annotations
+
+import base64
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ciassd_jax.formats.errors import FormatError, read_bytes
+
+# Where the files of a frame may lie, best place first: kind of file to paths with {} for the frame.
+Places = Mapping[str, Sequence[str]]
+# The split of every frame that has a cloud.
+ALL = "all"
+
+NUM_TRAINING, NUM_TESTING = 7481, 7518
+# The frames of Chen et al.'s train list as bits in base64, most significant first; val are the others.
+_TRAIN_BITS = (
+    "kX7iJqpeU8if8b+Z3Ufx1XSm7ja+GPjEQqbjXljC3Af0kTyni7miTiYycoxCGZMIlgCGOOXh821ArvMgOaBOUWq2W3iWzDQn+vDvN8DHFcbSXofp"
+    "2sflRVfxmi0zlFe4Ic39bQCHbt75JhXs+4Czua9qY01HxHM1pIlqFv7cQMmP6s3I3oDh5TwpRoVqoEIhDc7zBOIM7PkZFUKBoKKAD7SkfgfZ/4Et"
+    "DSbr9DFC6f7Ga25oiU/a2vk6Prnmk5B6HYtrUrksgFNJ2iuqj2rdVQ3vR7mpCBics/GYbdNlUM/LFnmUNu91YEjjaTBTlzv+YCEwn158t4Qa4hdB"
+    "qaPBwRUd9oSYqfDmLSZOBf48KRusp7ccvkczHulMld9yRMDGRc56lRMHstiXVA448+zEMx5d3JD/kO1WpBr2OQXC13HDFLId3AXy65SlMes624s5"
+    "0G3IKxAetQMpIvL+y5MxhNfEtjB7Ws/gK4BwttLzXL0mqAXtDTaKIM/tKA3MUFmOl15daMlV9Kg5Fbaa1KDtWsbNKRI2XsSvm2cvdlEVJMPPmswp"
+    "8Frvn4KAB6mRT+4bewjdBgY8Xuo2Du5tGM9p9Hf/Mi1QaA/qssni8McH/KZk7X4PxKfHronnnVIl9cXLvvVnWRwpxYmrx2XlnpX1k5axX3UGD3vH"
+    "FRsu6jdaiqZTILARBxTxAQdg/6Dn2JjwV3qNDGb86RMIwopcpJ4UsT9GGb42MYT8wBmIZtVVuU8IiXn2sjwF8eKz3BlZovTvBtVZFXYGl4M+SCCH"
+    "kIER1IQXNsUbPOR6dMg5uG7tB8Bmj7piXCvZNCTYQ5RN/WqRhJdYq1dRO5AcJQgd2PqxPxJ6QiuhhFRhMNi9+YnJkxWudeaGVrcPYiSLGBip/mkm"
+    "i5j/8/r8yNuiE8OOEpS837zP62VVHmB5wzFB5w/bDryMT5NFczNqvsZDG/IuYg7bS/+8DZco58HL3i/0L3u0irHiiBCI6s9jbYuW2RfSixF+QJSA"
+    "VZDEyeh6FM3BiNtvVleqOz2Nxdda7eM9dJ/eiQVcf7GfQ5fhxDKDdQejlofojjYPghHh/TEJhWseh0IzgLXypSsdGNUjx+HeExGujkdJ0NnwWvgO"
+    "aaGbLgQSQ5CaUWRiTfMzppBU1RaSroLFm9tfHDWGV2uR6VppRGzAGc4yaqJUAi7W+Wpbwk8b2YE1FO/cElSrqS1U8lGOCGYF5HjsyI8sKD53rDA6"
+    "4YqCYF2CWhtcQakA"
+)
+
+
+def official_split(split: str) -> tuple[str, ...] | None:
+    """Names of the frames of the official train, val, trainval or test list (SPEC 1.5); None for another name."""
+    train = np.unpackbits(np.frombuffer(base64.b64decode(_TRAIN_BITS), np.uint8), count=NUM_TRAINING).astype(bool)
+    frames = {
+        "train": np.flatnonzero(train),
+        "val": np.flatnonzero(~train),
+        "trainval": np.arange(NUM_TRAINING),
+        "test": np.arange(NUM_TESTING),
+    }
+    return tuple(f"{frame:06d}" for frame in frames[split].tolist()) if split in frames else None
+
+
+def split_names(root: Path, split: str, folder: Path, places: Places) -> tuple[str, ...]:
+    """Names of a split's frames: of "all" every cloud in `folder`, else `ImageSets/SPLIT.txt`, else the official list.
+
+    Raises FormatError for a split that is unknown, empty or names a frame twice, and for frames without their files.
+    """
+    path = split_file(root, split)
+    if split == ALL:
+        names = present_names(folder, places)
+        if not names:
+            raise FormatError(f"{folder} holds no {places['cloud'][0].format('NAME')}; check the path.")
+        return names
+    official = official_split(split)
+    if path.is_file():
+        names = read_split(path)
+    elif official is not None and "calibration" in places:
+        names = official
+    else:
+        raise FormatError(f"{path} does not exist; write it, one frame a line, or take the split '{ALL}'.")
+    missing = missing_files(folder, places, names)
+    if missing:
+        listed = path if path.is_file() else f"{root}: the official list of {split}"
+        raise FormatError(f"{listed}: {missing[0]}; copy them, or list in {path} the frames that you have.")
+    return names
+
+
+def split_file(root: Path, split: str) -> Path:
+    """The file that lists a split."""
+    return root / "ImageSets" / f"{split}.txt"
+
+
+def read_split(path: Path) -> tuple[str, ...]:
+    """Names in a split file, one a line; raises FormatError for none or for one twice."""
+    names = list_split(path)
+    twice = repeated_names(names)
+    if twice:
+        raise FormatError(f"{path}: {twice[0]}; list it once.")
+    if not names:
+        raise FormatError(f"{path} lists no frame; write one a line.")
+    return names
+
+
+def list_split(path: Path) -> tuple[str, ...]:
+    """Names in a split file as they stand."""
+    return tuple(read_bytes(path).decode("utf-8-sig", errors="replace").split())
+
+
+def repeated_names(names: Sequence[str]) -> list[str]:
+    """One sentence without its end for every name that occurs more than once."""
+    return [f"frame {name} is listed {count} times" for name, count in Counter(names).items() if count > 1]
+
+
+def present_names(folder: Path, places: Places) -> tuple[str, ...]:
+    """Names of the frames that have a cloud, ascending."""
+    return tuple(sorted({path.stem for place in places["cloud"] for path in folder.glob(place.format("*"))}))
+
+
+def find_file(folder: Path, places: Sequence[str], name: str) -> Path | None:
+    """The first of the places where the frame's file is there."""
+    return next((path for place in places if (path := folder / place.format(name)).is_file()), None)
+
+
+def missing_files(folder: Path, places: Places, names: Sequence[str]) -> list[str]:
+    """One sentence without its end for every kind of file that frames lack."""
+    sentences = []
+    for kind, paths in places.items():
+        lacking = [name for name in names if find_file(folder, paths, name) is None]
+        if lacking:
+            shown = ", ".join(lacking[:3]) + (", ..." if len(lacking) > 3 else "")
+            wanted = " or ".join(str(folder / path.format("NAME")) for path in paths)
+            sentences.append(f"{len(lacking)} of {len(names)} frames have no {kind} {wanted} ({shown})")
+    return sentences
