@@ -1,5 +1,7 @@
 """The levels of difficulty, at and beside their limits."""
 
+from itertools import pairwise
+
 import pytest
 
 from ciassd_jax.formats.kitti import ObjectRow
@@ -34,7 +36,7 @@ def test_difficulty(height: float, occluded: int, truncated: float, expected: in
 
 
 def test_levels_are_nested() -> None:
-    for easier, harder in zip(DIFFICULTIES, DIFFICULTIES[1:], strict=False):
+    for easier, harder in pairwise(DIFFICULTIES):
         assert easier.min_height >= harder.min_height
         assert easier.max_occlusion < harder.max_occlusion
         assert easier.max_truncation < harder.max_truncation
