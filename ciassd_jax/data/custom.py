@@ -10,7 +10,8 @@ import numpy as np
 
 from ciassd_jax.data.frames import Dataset, Frame, difficulty_by_points, unit_intensity
 from ciassd_jax.data.splits import Places, split_names
-from ciassd_jax.formats.errors import FormatError, read_bytes
+from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.kitti import read_lines
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.types import Boxes
 
@@ -44,12 +45,11 @@ def read_custom_rows(path: Path) -> list[CustomRow]:
 
     Raises FormatError, one sentence with file, line and remedy, for any other line.
     """
-    lines = read_bytes(path).decode("utf-8-sig", errors="replace").split("\n")
-    return [parse_custom_row(line, f"{path}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]
+    return [parse_custom_row(line, place) for place, line in read_lines(path)]
 
 
 def parse_custom_row(line: str, place: str) -> CustomRow:
-    """Read one row; `place` names its file and line in the FormatError for a row that is none."""
+    """Read one line; `place` names it in the FormatError for a line that is no row."""
     columns = line.split()
     if len(columns) != 8:
         raise FormatError(f"{place}: {len(columns)} columns; a label has the 8 {_COLUMNS}, so write it again.")

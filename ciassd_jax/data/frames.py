@@ -54,7 +54,7 @@ _POINTS_OF_DIFFICULTY = (50, 20, 5)
 def difficulty_by_points(points: Float[np.ndarray, "P C"], boxes: Boxes) -> Int[np.ndarray, " G"]:
     """Difficulty by the number of points inside a box: 0 from 50, 1 from 20, 2 from 5, else -1."""
     inside = points_in_boxes(points, boxes).sum(-1)
-    levels = sum((inside >= least).astype(np.int64) for least in _POINTS_OF_DIFFICULTY)
+    levels = (inside[:, None] >= np.array(_POINTS_OF_DIFFICULTY)).sum(-1)
     return np.where(levels > 0, len(_POINTS_OF_DIFFICULTY) - levels, -1)
 
 

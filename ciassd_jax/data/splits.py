@@ -13,7 +13,7 @@ from ciassd_jax.formats.errors import FormatError, read_bytes
 
 # Where the files of a frame may lie, best place first: kind of file to paths with {} for the frame.
 Places = Mapping[str, Sequence[str]]
-# The split of every frame that has a cloud.
+# The split of every frame that is there.
 ALL = "all"
 
 NUM_TRAINING, NUM_TESTING = 7481, 7518
@@ -47,49 +47,40 @@ def official_split(split: str) -> tuple[str, ...] | None:
 
 
 def split_names(root: Path, split: str, folder: Path, places: Places) -> tuple[str, ...]:
-    """Names of a split's frames: of "all" every cloud in `folder`, else `ImageSets/SPLIT.txt`, else the official list.
+    """Names of a split's frames (`listed_names`), each once and with its files in `folder`.
 
     Raises FormatError for a split that is unknown, empty or names a frame twice, and for frames without their files.
     """
-    path = split_file(root, split)
-    if split == ALL:
-        names = present_names(folder, places)
-        if not names:
-            raise FormatError(f"{folder} holds no {places['cloud'][0].format('NAME')}; check the path.")
-        return names
-    official = official_split(split)
-    if path.is_file():
-        names = read_split(path)
-    elif official is not None and "calibration" in places:
-        names = official
-    else:
-        raise FormatError(f"{path} does not exist; write it, one frame a line, or take the split '{ALL}'.")
+    names, source = listed_names(root, split, folder, places)
+    if not names:
+        raise FormatError(f"{source} names no frame; check the path, or list them one a line.")
+    twice = repeated_names(names)
+    if twice:
+        raise FormatError(f"{source}: {twice[0]}; list it once.")
     missing = missing_files(folder, places, names)
     if missing:
-        listed = path if path.is_file() else f"{root}: the official list of {split}"
-        raise FormatError(f"{listed}: {missing[0]}; copy them, or list in {path} the frames that you have.")
+        raise FormatError(f"{source}: {missing[0]}; copy them, or list those you have in {split_file(root, split)}.")
     return names
+
+
+def listed_names(root: Path, split: str, folder: Path, places: Places) -> tuple[tuple[str, ...], str]:
+    """Names of a split as they are listed, and where: `ImageSets/SPLIT.txt`, or the official list for KITTI's layout.
+
+    The split "all" is every frame that has a file in `folder`. Raises FormatError for a split that nothing lists.
+    """
+    path, official = split_file(root, split), official_split(split)
+    if split == ALL:
+        return present_names(folder, places), str(folder)
+    if path.is_file():
+        return tuple(read_bytes(path).decode("utf-8-sig", errors="replace").split()), str(path)
+    if official is None or "calibration" not in places:
+        raise FormatError(f"{path} does not exist; write it, one frame a line, or take the split '{ALL}'.")
+    return official, f"The official list of {split}"
 
 
 def split_file(root: Path, split: str) -> Path:
     """The file that lists a split."""
     return root / "ImageSets" / f"{split}.txt"
-
-
-def read_split(path: Path) -> tuple[str, ...]:
-    """Names in a split file, one a line; raises FormatError for none or for one twice."""
-    names = list_split(path)
-    twice = repeated_names(names)
-    if twice:
-        raise FormatError(f"{path}: {twice[0]}; list it once.")
-    if not names:
-        raise FormatError(f"{path} lists no frame; write one a line.")
-    return names
-
-
-def list_split(path: Path) -> tuple[str, ...]:
-    """Names in a split file as they stand."""
-    return tuple(read_bytes(path).decode("utf-8-sig", errors="replace").split())
 
 
 def repeated_names(names: Sequence[str]) -> list[str]:
@@ -98,8 +89,9 @@ def repeated_names(names: Sequence[str]) -> list[str]:
 
 
 def present_names(folder: Path, places: Places) -> tuple[str, ...]:
-    """Names of the frames that have a cloud, ascending."""
-    return tuple(sorted({path.stem for place in places["cloud"] for path in folder.glob(place.format("*"))}))
+    """Names of the frames that have any of their files, ascending."""
+    paths = (path for patterns in places.values() for pattern in patterns for path in folder.glob(pattern.format("*")))
+    return tuple(sorted({path.stem for path in paths}))
 
 
 def find_file(folder: Path, places: Sequence[str], name: str) -> Path | None:

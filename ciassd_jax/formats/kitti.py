@@ -118,15 +118,18 @@ def read_rows(path: Pathlike) -> list[ObjectRow]:
 
     Raises FormatError, one sentence with file, line and remedy, for any other line.
     """
-    rows = []
-    for number, line in enumerate(_read_text(path).split("\n"), 1):
-        columns = line.split()
-        if columns:
-            rows.append(_parse_row(columns, f"{path}, line {number}"))
-    return rows
+    return [parse_row(line, place) for place, line in read_lines(path)]
 
 
-def _parse_row(columns: list[str], place: str) -> ObjectRow:
+def read_lines(path: Pathlike) -> list[tuple[str, str]]:
+    """The lines of a text file that are not blank, each with its place for messages: "FILE, line N"."""
+    lines = enumerate(_read_text(path).split("\n"), 1)
+    return [(f"{path}, line {number}", line) for number, line in lines if line.strip()]
+
+
+def parse_row(line: str, place: str) -> ObjectRow:
+    """Read one line; `place` names it in the FormatError for a line that is no row."""
+    columns = line.split()
     if len(columns) not in (15, 16):
         raise FormatError(f"{place}: {len(columns)} columns; a label has 15 and a result 16, so write it again.")
     try:
