@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from ciassd_jax.data.frames import Dataset, Frame, unit_intensity
-from ciassd_jax.data.splits import Places, find_file, split_names
+from ciassd_jax.data.splits import Places, find_file, present_files, split_names
 from ciassd_jax.formats.errors import FormatError, FormatWarning
 from ciassd_jax.formats.kitti import ObjectRow, read_rows, rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera, read_camera, view_planes
@@ -33,9 +34,13 @@ def open_kitti(root: Path, split: str, image_size: tuple[int, int] | None = None
     """
     folder, places = kitti_folder(root, split)
     names = split_names(root, split, folder, places)
-    if image_size is None:
-        _warn_of_guessed_sizes(folder, names)
-    return Dataset(names, partial(read_kitti_frame, folder=folder, labelled="label" in places, image_size=image_size))
+    if image_size is None and (guess := crop_without_images(folder, names)):
+        warnings.warn(guess, FormatWarning, stacklevel=3)
+    return Dataset(
+        names,
+        partial(read_kitti_frame, folder=folder, labelled="label" in places, image_size=image_size),
+        partial(present_files, folder=folder, places=places),
+    )
 
 
 def kitti_folder(root: Path, split: str) -> tuple[Path, Places]:
@@ -79,13 +84,12 @@ def crop_to_view(points: Float32[np.ndarray, "N 4"], camera: Camera) -> Float32[
     return points[inside_planes(points[:, :3].astype(np.float64), view_planes(camera))]
 
 
-def _warn_of_guessed_sizes(folder: Path, names: tuple[str, ...]) -> None:
-    """Say how many clouds would be cropped to an image whose size is only known from the focal length."""
+def crop_without_images(folder: Path, names: Sequence[str]) -> str | None:
+    """One sentence on the full clouds that must be cropped to images of which only the usual size is known."""
     guessed = sum(not any((folder / path.format(name)).is_file() for path in (REDUCED, IMAGE)) for name in names)
-    if guessed:
-        warnings.warn(
-            f"{folder / IMAGE.format('NAME')} is missing for {guessed} of {len(names)} frames whose clouds are cropped "
-            "to the image; the usual size for the camera's focal length is used instead.",
-            FormatWarning,
-            stacklevel=4,
-        )
+    if not guessed:
+        return None
+    return (
+        f"{folder / IMAGE.format('NAME')} is missing for {guessed} of {len(names)} frames whose clouds are cropped to "
+        "the image; the usual size for the camera's focal length is used instead."
+    )

@@ -1,0 +1,198 @@
+"""The check of a whole data set, before a training finds out."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from ciassd_jax.config import Config, GridConfig
+from ciassd_jax.data.check_labels import check_object, check_types, read_labelled
+from ciassd_jax.data.custom import PLACES as CUSTOM_PLACES
+from ciassd_jax.data.findings import Finding, Labelled, Report, TypeSummary
+from ciassd_jax.data.folders import find_root, is_custom
+from ciassd_jax.data.frames import unit_intensity
+from ciassd_jax.data.kitti import IMAGE, crop_without_images, kitti_folder, read_seen_points
+from ciassd_jax.data.splits import ALL, Places, find_file, listed_names, missing_files, repeated_names
+from ciassd_jax.formats.errors import FormatError, FormatWarning, Pathlike
+from ciassd_jax.formats.kitti_camera import Camera, read_camera
+from ciassd_jax.formats.points import read_points
+from ciassd_jax.ops.footprints import points_in_boxes
+from ciassd_jax.types import Boxes
+
+# A cloud with less than this part of the usual number of points is odd.
+_SPARSE = 0.1
+
+
+class _Checked(NamedTuple):
+    """One frame: what was found, its objects, which of them hold no point, its points and occupied voxels."""
+
+    findings: list[Finding]
+    objects: list[Labelled]
+    empty: Bool[np.ndarray, " G"]
+    points: int
+    voxels: int
+
+
+def check_dataset(
+    root: Pathlike | None,
+    split: str | None = None,
+    *,
+    config: Config | None = None,
+    image_size: tuple[int, int] | None = None,
+    track: Callable[[Sequence[str]], Iterable[str]] = iter,
+) -> Report:
+    """Read every frame of a split, or without one all that are there and the split files, and say what is odd.
+
+    `config` says the grid, the classes and the capacities (the paper's without one); `root` and `image_size` are as
+    for `open_dataset`; `track` sees the frames go by, for a progress bar. Raises FormatError where there is no frame.
+    """
+    config, folder = config or Config(), find_root(root)
+    root, places = folder, CUSTOM_PLACES
+    if not is_custom(root):
+        folder, places = kitti_folder(root, split or ALL)
+    listed, source = listed_names(root, split or ALL, folder, places)
+    names = [name for name in dict.fromkeys(listed) if find_file(folder, places["cloud"], name)]
+    if not names:
+        raise FormatError(f"{source} names no frame whose cloud is there; check the path.")
+    findings = list(_check_names(listed, source, folder, places))
+    findings += [] if split else _check_split_files(root)
+    if not is_custom(root) and image_size is None and (guess := crop_without_images(folder, names)):
+        findings.append(Finding("image size", False, guess))
+    checked = [_check_frame(name, folder, places, config.grid, image_size) for name in track(names)]
+    for frame in checked:
+        findings += frame.findings
+    objects = [labelled for frame in checked for labelled in frame.objects]
+    findings += check_types(objects, config)
+    findings += _check_amounts(names, checked, config)
+    empty = np.concatenate([frame.empty for frame in checked])
+    points, voxels = (tuple(getattr(frame, part) for frame in checked) for part in ("points", "voxels"))
+    return Report(tuple(findings), points, voxels, _summarise(objects, empty, config.grid))
+
+
+def _check_names(names: Sequence[str], source: str, folder: Path, places: Places) -> Iterator[Finding]:
+    """Names that are listed twice or whose files are missing."""
+    for sentence in repeated_names(names):
+        yield Finding("split", True, f"{source}: {sentence}; list it once.")
+    for sentence in missing_files(folder, places, names):
+        yield Finding("missing file", True, f"{source}: {sentence}; copy them, or take the frames off the list.")
+
+
+def _check_split_files(root: Path) -> Iterator[Finding]:
+    """All of ImageSets: each file by itself, and whether train and val share frames."""
+    splits = {}
+    for path in sorted((root / "ImageSets").glob("*.txt")):
+        folder, places = (root, CUSTOM_PLACES) if is_custom(root) else kitti_folder(root, path.stem)
+        names, source = listed_names(root, path.stem, folder, places)
+        splits[path.stem] = set(names)
+        yield from _check_names(names, source, folder, {"cloud": places["cloud"]})
+    shared = sorted(splits.get("train", set()) & splits.get("val", set()))
+    if shared:
+        yield Finding(
+            "split",
+            True,
+            f"{root / 'ImageSets'}: train.txt and val.txt share {len(shared)} frames, the first {shared[0]}; take them "
+            "off one of the two.",
+        )
+
+
+def _check_frame(
+    name: str, folder: Path, places: Places, grid: GridConfig, image_size: tuple[int, int] | None
+) -> _Checked:
+    """Everything about one frame whose cloud is there."""
+    nothing = np.zeros(0, bool)
+    try:
+        camera = None
+        if "calibration" in places:
+            camera = read_camera(folder / f"calib/{name}.txt", folder / IMAGE.format(name), image_size)
+        points, findings = _read_cloud(name, folder, places, camera)
+    except FormatError as error:
+        return _Checked([Finding("unreadable file", True, str(error))], [], nothing, 0, 0)
+    label = find_file(folder, places.get("label", ()), name)
+    objects: list[Labelled] = []
+    if label is not None:
+        objects, more = read_labelled(label, camera and camera.calibration)
+        findings += more
+    findings += [finding for labelled in objects for finding in check_object(labelled)]
+    boxes = Boxes.from_array(np.array([labelled.box for labelled in objects]).reshape(-1, 7))
+    empty = np.asarray(points_in_boxes(points, boxes)).sum(-1) == 0
+    findings += [
+        Finding("no point", False, f"{labelled.place}: no point lies inside this {labelled.type}; check its box.")
+        for labelled, without in zip(objects, empty, strict=True)
+        if without
+    ]
+    return _Checked(findings, objects, empty, len(points), _count_voxels(points, grid))
+
+
+def _read_cloud(
+    name: str, folder: Path, places: Places, camera: Camera | None
+) -> tuple[Float32[np.ndarray, "P 4"], list[Finding]]:
+    """The frame's points as training would see them, and what is odd about their values."""
+    path = find_file(folder, places["cloud"], name)
+    assert path is not None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", FormatWarning)
+        points = read_seen_points(folder, name, camera) if camera else unit_intensity(read_points(path), path)
+    findings = [Finding("intensity", False, str(one.message)) for one in caught]
+    broken = int((~np.isfinite(points).all(1)).sum())
+    if broken:
+        text = f"{path}: {broken} of {len(points)} points are not finite; remove them."
+        findings.append(Finding("not finite", True, text))
+    if ((points[:, 3] < 0) | (points[:, 3] > 1)).any():
+        text = f"{path}: intensities are not all in [0, 1]; scale them so."
+        findings.append(Finding("intensity", False, text))
+    if not len(points):
+        findings.append(Finding("few points", True, f"{path}: no point is left; check the calibration and the cloud."))
+    return points, findings
+
+
+def _count_voxels(points: Float32[np.ndarray, "P 4"], grid: GridConfig) -> int:
+    """How many voxels of the grid are occupied."""
+    shape = np.array(grid.cells)
+    with np.errstate(invalid="ignore"):
+        cells = np.floor((points[:, :3] - np.array(grid.minimum, np.float32)) / np.array(grid.voxel_size, np.float32))
+    inside = ((cells >= 0) & (cells < shape)).all(-1)
+    return len(np.unique(np.ravel_multi_index(tuple(cells[inside].astype(np.int64).T), tuple(shape))))
+
+
+def _check_amounts(names: Sequence[str], checked: Sequence[_Checked], config: Config) -> Iterator[Finding]:
+    """Clouds that are far smaller than usual, and frames beyond a capacity of the config."""
+    usual = float(np.median([frame.points for frame in checked]))
+    for name, frame in zip(names, checked, strict=True):
+        if 0 < frame.points < _SPARSE * usual:
+            text = f"Frame {name}: {frame.points} points where {usual:.0f} are usual; check its cloud."
+            yield Finding("few points", False, text)
+    for what, option, capacity, amounts in (
+        ("points", "data.max_points", config.data.max_points, [frame.points for frame in checked]),
+        ("objects", "data.max_boxes", config.data.max_boxes, [len(frame.objects) for frame in checked]),
+        ("occupied voxels", "grid.max_voxels", config.grid.max_voxels, [frame.voxels for frame in checked]),
+    ):
+        above = sum(amount > capacity for amount in amounts)
+        if above:
+            yield Finding(
+                "capacity",
+                False,
+                f"{above} of {len(amounts)} frames have more than {capacity} {what}, up to {max(amounts)}; the rest is "
+                f"cut and counted, so raise {option} to keep it.",
+            )
+
+
+def _summarise(objects: Sequence[Labelled], empty: Bool[np.ndarray, " G"], grid: GridConfig) -> dict[str, TypeSummary]:
+    """Objects by type, the most frequent first."""
+    boxes = np.array([labelled.box for labelled in objects]).reshape(-1, 7)
+    types = np.array([labelled.type for labelled in objects])
+    center = boxes[:, :3]
+    outside = ((center < np.array(grid.minimum)) | (center > np.array(grid.maximum))).sum(-1) > 0
+    summaries = {}
+    for name in dict.fromkeys(types.tolist()):
+        mine = types == name
+        size = np.median(boxes[mine, 3:6], axis=0).tolist()
+        height = float(np.median(boxes[mine, 2]))
+        summaries[name] = TypeSummary(
+            int(mine.sum()), int(outside[mine].sum()), int(empty[mine].sum()), tuple(size), height
+        )
+    return dict(sorted(summaries.items(), key=lambda item: -item[1].objects))

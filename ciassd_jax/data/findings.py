@@ -1,0 +1,55 @@
+"""What a check of a data set found."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from ciassd_jax.formats.kitti import ObjectRow
+
+
+class Finding(NamedTuple):
+    """One sentence: file, line, what, remedy. Serious ones must be mended, the others are worth a look."""
+
+    kind: str
+    serious: bool
+    text: str
+
+
+class Labelled(NamedTuple):
+    """One object of a label file: where its line is, and its box in the LiDAR frame (x, y, z, l, w, h, yaw)."""
+
+    place: str
+    type: str
+    box: Float64[np.ndarray, " 7"]
+    # The line itself, for KITTI's layout.
+    row: ObjectRow | None
+
+
+class TypeSummary(NamedTuple):
+    """The objects of one type: how many, how many of them out of the grid's range and without any point.
+
+    `size` (length, width, height) and `center_z` are medians in metres.
+    """
+
+    objects: int
+    out_of_range: int
+    without_points: int
+    size: tuple[float, float, float]
+    center_z: float
+
+
+class Report(NamedTuple):
+    """The check of a data set: findings, numbers of points and of occupied voxels per frame, objects by type."""
+
+    findings: tuple[Finding, ...]
+    points: tuple[int, ...]
+    voxels: tuple[int, ...]
+    types: dict[str, TypeSummary]
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing must be mended."""
+        return not any(finding.serious for finding in self.findings)
