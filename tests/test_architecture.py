@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "ciassd_jax"
 LAYERS = [
     {"types", "config", "presets"},
     {"ops", "formats"},
-    {"model", "anchors", "detections", "data"},
+    {"model", "anchors", "detections", "data", "evaluation"},
     {"prediction", "weights", "detector", "export", "info", "predict_files", "demo", "view", "cli"},
 ]
 SIBLINGS = {("prediction", "weights"), ("weights", "prediction")}

@@ -1,0 +1,133 @@
+"""What evaluation compares: the labelled and the detected objects of a frame, and of a whole set in flat arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from ciassd_jax.formats.kitti import ObjectRow
+from ciassd_jax.formats.kitti_difficulty import difficulty_of
+from ciassd_jax.types import Boxes
+
+# Fewest points in the box of an easy, moderate and hard object, for data without a camera.
+DIFFICULTY_POINTS = (100, 30, 5)
+# What KITTI writes for a location that is not given.
+_NO_LOCATION = -1000.0
+
+
+class LabelledObjects(NamedTuple):
+    """The labels of one frame, G objects in the order of their file, in float64.
+
+    `difficulty` is an index in formats.kitti_difficulty.DIFFICULTIES or -1. `boxes` are in any right-handed frame
+    with z up whose origin is the sensor. `image_boxes` (x1, y1, x2, y2) in pixels and `alpha` in radians are None for
+    data without a camera; `points`, the number of points in each box, is None where it is not known.
+    """
+
+    types: tuple[str, ...]
+    difficulty: Int[np.ndarray, " G"]
+    boxes: Boxes
+    image_boxes: Float64[np.ndarray, "G 4"] | None = None
+    alpha: Float64[np.ndarray, " G"] | None = None
+    points: Int[np.ndarray, " G"] | None = None
+
+
+class DetectedObjects(NamedTuple):
+    """The detections of one frame, D objects; the fields of LabelledObjects, and finite scores.
+
+    NaN stands where a result gives no place in the plane (center x) or no height (center z).
+    """
+
+    types: tuple[str, ...]
+    score: Float64[np.ndarray, " D"]
+    boxes: Boxes
+    image_boxes: Float64[np.ndarray, "D 4"] | None = None
+    alpha: Float64[np.ndarray, " D"] | None = None
+    points: Int[np.ndarray, " D"] | None = None
+
+
+class FlatObjects(NamedTuple):
+    """The objects of N frames in one array per field, frame after frame; `types` in lower case.
+
+    Labels have `difficulty` and NaN scores, detections scores and difficulty -1. Without a camera the image boxes
+    and alphas are NaN; without points `points` is -1.
+    """
+
+    frame: Int[np.ndarray, " O"]
+    types: np.ndarray
+    difficulty: Int[np.ndarray, " O"]
+    score: Float64[np.ndarray, " O"]
+    boxes: Boxes
+    image_boxes: Float64[np.ndarray, "O 4"]
+    alpha: Float64[np.ndarray, " O"]
+    points: Int[np.ndarray, " O"]
+
+
+def labels_from_rows(rows: Sequence[ObjectRow]) -> LabelledObjects:
+    """The objects of a label file, DontCare areas among them; boxes in axes right, forward, up from the camera."""
+    difficulty = np.array([difficulty_of(row) for row in rows], np.int64)
+    return LabelledObjects(tuple(row.type for row in rows), difficulty, *_geometry(rows))
+
+
+def detections_from_rows(rows: Sequence[ObjectRow]) -> DetectedObjects:
+    """The objects of a result file, whose rows all have a score; boxes as in `labels_from_rows`."""
+    score = np.array([row.score for row in rows], np.float64)
+    return DetectedObjects(tuple(row.type for row in rows), score, *_geometry(rows))
+
+
+def difficulty_by_points(points: Int[np.ndarray, " G"]) -> Int[np.ndarray, " G"]:
+    """Difficulty of objects that no camera has seen: the first of DIFFICULTY_POINTS that they reach, -1 for none."""
+    reached = points[:, None] >= np.array(DIFFICULTY_POINTS)
+    return np.where(reached.any(1), reached.argmax(1), -1)
+
+
+def flatten(frames: Sequence[LabelledObjects] | Sequence[DetectedObjects]) -> FlatObjects:
+    """Join frames; raises ValueError if only some of them have a camera or points."""
+    sizes = [len(frame.types) for frame in frames]
+    scores = [getattr(frame, "score", np.full(size, np.nan)) for frame, size in zip(frames, sizes, strict=True)]
+    difficulty = [getattr(frame, "difficulty", np.full(size, -1)) for frame, size in zip(frames, sizes, strict=True)]
+    return FlatObjects(
+        np.repeat(np.arange(len(frames)), sizes),
+        np.array([name.lower() for frame in frames for name in frame.types], np.str_),
+        np.concatenate([np.zeros(0, np.int64), *difficulty]),
+        np.concatenate([np.zeros(0), *scores]),
+        Boxes.from_array(np.concatenate([np.zeros((0, 7)), *(frame.boxes.to_array() for frame in frames)])),
+        _join("image_boxes", frames, sizes, np.full(4, np.nan)),
+        _join("alpha", frames, sizes, np.array(np.nan)),
+        _join("points", frames, sizes, np.array(-1)),
+    )
+
+
+def select(objects: FlatObjects, index: np.ndarray) -> FlatObjects:
+    """The objects at an index or mask."""
+    boxes = Boxes(*(leaf[index] for leaf in objects.boxes))
+    return FlatObjects(*(boxes if field is objects.boxes else field[index] for field in objects))
+
+
+def _geometry(
+    rows: Sequence[ObjectRow],
+) -> tuple[Boxes, Float64[np.ndarray, "O 4"], Float64[np.ndarray, " O"]]:
+    location = np.array([row.location for row in rows], np.float64).reshape(-1, 3)
+    size = np.array([row.dimensions[::-1] for row in rows], np.float64).reshape(-1, 3)
+    rotation_y = np.array([row.rotation_y for row in rows], np.float64)
+    # Depth has no say in what is given.
+    location[:, :2][location[:, :2] == _NO_LOCATION] = np.nan
+    center = np.stack([location[:, 0], location[:, 2], size[:, 2] / 2 - location[:, 1]], -1)
+    image_boxes = np.array([row.bbox for row in rows], np.float64).reshape(-1, 4)
+    alpha = np.array([row.alpha for row in rows], np.float64)
+    return Boxes(center, size, -rotation_y), image_boxes, alpha
+
+
+def _join(
+    field: str, frames: Sequence[LabelledObjects] | Sequence[DetectedObjects], sizes: list[int], missing: np.ndarray
+) -> np.ndarray:
+    """One field of all frames, or `missing` for every object where no frame has it."""
+    parts = [getattr(frame, field) for frame in frames]
+    lacking = [part is None for part in parts]
+    if any(lacking) and not all(lacking):
+        raise ValueError(f"{field} is given for some frames only; give it for all or for none.")
+    if not parts or all(lacking):
+        return np.broadcast_to(missing, (sum(sizes), *missing.shape)).copy()
+    return np.concatenate(parts)

@@ -1,0 +1,105 @@
+"""Overlap of the objects of one frame in the image, in the plane and in space, for all frames at once."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from ciassd_jax.evaluation.objects import FlatObjects
+from ciassd_jax.ops.iou import intersection_bev
+from ciassd_jax.types import Boxes
+
+# Overlap of image boxes, of footprints, of volumes.
+Geometry = Literal["bbox", "bev", "3d"]
+
+
+class Intersections(NamedTuple):
+    """E pairs of objects of one frame that share some area or volume, by ascending `first`, then `second`.
+
+    `shared` is theirs, `first_size` and `second_size` that of each object: square pixels, square metres or cubic
+    metres.
+    """
+
+    first: Int[np.ndarray, " E"]
+    second: Int[np.ndarray, " E"]
+    shared: Float64[np.ndarray, " E"]
+    first_size: Float64[np.ndarray, " E"]
+    second_size: Float64[np.ndarray, " E"]
+
+    @property
+    def overlap(self) -> Float64[np.ndarray, " E"]:
+        """Intersection over union."""
+        return self.shared / (self.first_size + self.second_size - self.shared)
+
+    @property
+    def coverage(self) -> Float64[np.ndarray, " E"]:
+        """The part of the second object that the first covers."""
+        return self.shared / self.second_size
+
+
+def intersect(a: FlatObjects, b: FlatObjects) -> dict[Geometry, Intersections]:
+    """What objects of `a` and `b` share; as the official rules have it, a box of negative height shares no volume."""
+    first, second = _pairs(a.frame, b.frame)
+    image = _image_intersections(a.image_boxes, b.image_boxes, first, second)
+    near = _near(a.boxes, b.boxes, first, second)
+    first, second = first[near], second[near]
+    one, other = (Boxes(*(leaf[index] for leaf in boxes)) for boxes, index in ((a.boxes, first), (b.boxes, second)))
+    footprint = intersection_bev(_unsigned(one), _unsigned(other))
+    area, other_area = (np.abs(boxes.size[:, 0] * boxes.size[:, 1]) for boxes in (one, other))
+    top = np.minimum(*(boxes.center[:, 2] + boxes.size[:, 2] / 2 for boxes in (one, other)))
+    bottom = np.maximum(*(boxes.center[:, 2] - boxes.size[:, 2] / 2 for boxes in (one, other)))
+    volume = footprint * np.where(top > bottom, top - bottom, 0)
+    return {
+        "bbox": image,
+        "bev": _shared_only(first, second, footprint, area, other_area),
+        "3d": _shared_only(first, second, volume, area * one.size[:, 2], other_area * other.size[:, 2]),
+    }
+
+
+def _pairs(
+    frame: Int[np.ndarray, " A"], other: Int[np.ndarray, " B"]
+) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
+    """All pairs of objects of the same frame; both lists of frames ascend."""
+    start, stop = np.searchsorted(other, frame, "left"), np.searchsorted(other, frame, "right")
+    count = stop - start
+    first = np.repeat(np.arange(len(frame)), count)
+    before = np.cumsum(count) - count
+    return first, np.arange(len(first)) + (start - before)[first]
+
+
+def _image_intersections(
+    a: Float64[np.ndarray, "A 4"],
+    b: Float64[np.ndarray, "B 4"],
+    first: Int[np.ndarray, " E"],
+    second: Int[np.ndarray, " E"],
+) -> Intersections:
+    low = np.maximum(a[first, :2], b[second, :2])
+    high = np.minimum(a[first, 2:], b[second, 2:])
+    # Comparisons with NaN are false: without a camera nothing is shared.
+    shared = np.where((high > low).all(1), (high - low).prod(1), 0)
+    area, other_area = ((boxes[:, 2:] - boxes[:, :2]).prod(1) for boxes in (a, b))
+    return _shared_only(first, second, shared, area[first], other_area[second])
+
+
+def _near(a: Boxes, b: Boxes, first: Int[np.ndarray, " E"], second: Int[np.ndarray, " E"]) -> Int[np.ndarray, " near"]:
+    """Pairs whose circumscribed circles meet; no others can share anything."""
+    distance = np.hypot(*(a.center[first, :2] - b.center[second, :2]).T)
+    radius, other_radius = (np.hypot(*boxes.size[:, :2].T) / 2 for boxes in (a, b))
+    return np.flatnonzero(distance <= radius[first] + other_radius[second])
+
+
+def _unsigned(boxes: Boxes) -> Boxes:
+    return boxes._replace(size=np.abs(boxes.size))
+
+
+def _shared_only(
+    first: Int[np.ndarray, " E"],
+    second: Int[np.ndarray, " E"],
+    shared: Float64[np.ndarray, " E"],
+    first_size: Float64[np.ndarray, " E"],
+    second_size: Float64[np.ndarray, " E"],
+) -> Intersections:
+    some = shared > 0
+    return Intersections(first[some], second[some], shared[some], first_size[some], second_size[some])
