@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ciassd_jax.data.frames import Dataset, Frame, difficulty_by_points, unit_intensity
-from ciassd_jax.data.splits import Places, split_names
+from ciassd_jax.data.splits import Places, present_files, split_names
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.formats.kitti import read_lines
 from ciassd_jax.formats.points import read_points
@@ -28,7 +28,8 @@ class CustomRow(NamedTuple):
 
 def open_custom(root: Path, split: str) -> Dataset:
     """The frames that ROOT/ImageSets/SPLIT.txt lists, or every one for the split "all"; all of them are labelled."""
-    return Dataset(split_names(root, split, root, PLACES), partial(read_custom_frame, root=root))
+    names = split_names(root, split, root, PLACES)
+    return Dataset(names, partial(read_custom_frame, root=root), partial(present_files, folder=root, places=PLACES))
 
 
 def read_custom_frame(name: str, *, root: Path) -> Frame:

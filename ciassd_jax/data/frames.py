@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -34,10 +35,14 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True)
 class Dataset:
-    """The frames of one split by name; `read_frame` reads one of them. Workers can pickle it."""
+    """The frames of one split by name; `read_frame` reads one of them. Workers can pickle it.
+
+    `find_files` gives the files that a frame is read from; frames of other origin have none.
+    """
 
     names: tuple[str, ...]
     read_frame: Callable[[str], Frame]
+    find_files: Callable[[str], tuple[Path, ...]] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -45,6 +50,10 @@ class Dataset:
     def read(self, index: int) -> Frame:
         """The frame with that place in `names`; raises FormatError for a file that cannot be used."""
         return self.read_frame(self.names[index])
+
+    def sources(self, index: int) -> tuple[Path, ...]:
+        """The files that the frame with that place is read from."""
+        return self.find_files(self.names[index]) if self.find_files else ()
 
 
 # An object with so many points inside is easy, moderate, hard where no camera says how large it looks.

@@ -99,6 +99,12 @@ def find_file(folder: Path, places: Sequence[str], name: str) -> Path | None:
     return next((path for place in places if (path := folder / place.format(name)).is_file()), None)
 
 
+def present_files(name: str, *, folder: Path, places: Places) -> tuple[Path, ...]:
+    """The files of a frame that are there, one of every kind."""
+    found = (find_file(folder, paths, name) for paths in places.values())
+    return tuple(path for path in found if path is not None)
+
+
 def missing_files(folder: Path, places: Places, names: Sequence[str]) -> list[str]:
     """One sentence without its end for every kind of file that frames lack."""
     sentences = []
