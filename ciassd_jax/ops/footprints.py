@@ -56,5 +56,5 @@ def points_in_boxes(points: Float[Array, "P C"], boxes: Boxes) -> Bool[Array, "G
     dx, dy, dz = (points[None, :, axis] - boxes.center[:, axis, None] for axis in range(3))
     along, across, above = (boxes.size[:, axis, None] / 2 for axis in range(3))
     cosine, sine = xp.cos(boxes.yaw)[:, None], xp.sin(boxes.yaw)[:, None]
-    inside = (abs(dx * cosine + dy * sine) < along) & (abs(dy * cosine - dx * sine) < across)
-    return inside & (abs(dz) < above)
+    inside = (xp.abs(dx * cosine + dy * sine) < along) & (xp.abs(dy * cosine - dx * sine) < across)
+    return inside & (xp.abs(dz) < above)

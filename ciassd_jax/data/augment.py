@@ -1,0 +1,233 @@
+"""Augmentation of one padded scene on the device (paper section 4.1, SPEC section 2.2 to 2.4); `vmap` for a batch.
+
+Every step is a pure function with fixed shapes and leaves padding zero. Where a step needs chance, the numbers that it
+drew are the arguments of a function without any, so that the step can be held against its definition.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Bool, Float
+
+from ciassd_jax.config import AugmentationConfig, Config
+from ciassd_jax.ops.footprints import footprint_corners, footprints_collide, points_in_boxes
+from ciassd_jax.types import Array, Boxes, GroundTruth, PasteObjects, PointCloud, Scene
+
+
+def scene_key(seed: int | Array, epoch: int | Array, frame: int | Array) -> jax.Array:
+    """The key of a scene's augmentation: the same numbers draw the same bits, in whatever order scenes come."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), epoch), frame)
+
+
+def augment(key: jax.Array, scene: Scene, objects: PasteObjects, config: Config) -> Scene:
+    """Augment one scene in the order of SPEC 2.2, as the switches of `config.data.augmentation` say.
+
+    Obstacles keep objects apart and leave at the end. Each step has a key of its own: switching one off leaves
+    what the others draw.
+    """
+    switches = config.data.augmentation
+    for_noise, for_transform, for_order = jax.random.split(key, 3)
+    if switches.paste:
+        scene = paste_objects(scene, objects, paste_up_to=tuple(one.paste_up_to for one in config.classes))
+    if switches.object_noise:
+        scene = add_object_noise(for_noise, scene, switches)
+    if switches.global_transform:
+        scene = transform_globally(for_transform, scene, switches)
+    scene = shuffle_points(for_order, scene)
+    return keep_targets(scene, minimum=config.grid.minimum, maximum=config.grid.maximum)
+
+
+def paste_objects(scene: Scene, objects: PasteObjects, *, paste_up_to: tuple[int, ...]) -> Scene:
+    """Add the objects that collide with nothing, their points first; scene points inside them leave (SPEC 2.2, 2.3).
+
+    `paste_up_to` is the number of slots of one round for every class. What finds no room is counted: an object
+    without a free box is not pasted, and points are cut from the end of the scene's.
+    """
+    accepted = accept_objects(scene.truth, objects, paste_up_to=paste_up_to)
+    pasted = accepted & (scene.truth.count + jnp.cumsum(accepted) <= scene.truth.label.shape[0])
+
+    points, capacity = scene.cloud.points, scene.cloud.points.shape[0]
+    covered = jnp.any(points_in_boxes(points, objects.boxes) & pasted[:, None], 0)
+    comes = jnp.take(pasted, objects.owner, mode="fill", fill_value=False)
+    kept = jnp.concatenate([comes, _real_points(scene) & ~covered])
+    total = kept.sum(dtype=jnp.int32)
+    points = _pick(jnp.concatenate([objects.points, points]), kept, capacity)
+
+    boxes = Boxes(*(jnp.concatenate(pair) for pair in zip(scene.truth.boxes, objects.boxes, strict=True)))
+    truth = GroundTruth(boxes, jnp.concatenate([scene.truth.label, objects.label]), scene.truth.count)
+    kept = jnp.concatenate([_real_boxes(scene.truth), pasted])
+    return scene._replace(
+        cloud=PointCloud(points, jnp.minimum(total, capacity)),
+        truth=_pick_truth(truth, kept, scene.truth.label.shape[0]),
+        points_cut=scene.points_cut + jnp.maximum(total - capacity, 0),
+        boxes_cut=scene.boxes_cut + (accepted & ~pasted).sum(dtype=jnp.int32),
+    )
+
+
+def accept_objects(truth: GroundTruth, objects: PasteObjects, *, paste_up_to: tuple[int, ...]) -> Bool[Array, " O"]:
+    """Which objects are pasted (SPEC 2.3): per class two rounds, the second of as many draws as are still wanted.
+
+    Draws of a round are judged in order. One is out if it collides with a truth box, an accepted object or a later
+    draw of its round, so that of two draws that collide the earlier one is out.
+    """
+    boxes = _with_axis(objects.boxes, 1)
+    blocked = jnp.any(footprints_collide(boxes, _with_axis(truth.boxes, 0)) & _real_boxes(truth)[None], 1)
+    itself = jnp.eye(blocked.shape[0], dtype=bool)
+    collide = jnp.asarray(footprints_collide(boxes, _with_axis(objects.boxes, 0))) & ~itself
+
+    def judge(slot: jax.Array, alive: jax.Array) -> jax.Array:
+        return alive.at[slot].set(alive[slot] & ~blocked[slot] & ~jnp.any(collide[slot] & alive))
+
+    alive, start = jnp.zeros_like(blocked), 0
+    for label, slots in enumerate(paste_up_to):
+        wanted = objects.wanted[label]
+        for _ in range(2):
+            stop = start + slots
+            draws = objects.valid[start:stop]
+            draws &= jnp.cumsum(draws) <= wanted
+            alive = lax.fori_loop(start, stop, judge, alive.at[start:stop].set(draws))
+            wanted -= alive[start:stop].sum(dtype=jnp.int32)
+            start = stop
+    return alive
+
+
+def add_object_noise(key: jax.Array, scene: Scene, config: AugmentationConfig) -> Scene:
+    """Shift and turn every target with its points, by the first of its tries that collides with nothing (SPEC 2.4)."""
+
+    def draw(slot: Array) -> tuple[jax.Array, jax.Array]:
+        for_shift, for_turn = jax.random.split(jax.random.fold_in(key, slot))
+        shift = jax.random.normal(for_shift, (config.noise_tries, 3)) * jnp.array([config.noise_shift])
+        limit = config.noise_rotation
+        return shift, jax.random.uniform(for_turn, (config.noise_tries,), minval=-limit, maxval=limit)
+
+    # A key per box: how many boxes a scene has room for changes nothing.
+    shifts, turns = jax.vmap(draw)(jnp.arange(scene.truth.label.shape[0]))
+    return move_objects(scene, shifts, turns)
+
+
+def move_objects(scene: Scene, shifts: Float[Array, "G T 3"], turns: Float[Array, "G T"]) -> Scene:
+    """Move each target by the first of its T shifts (metres) and turns (radians) that keeps it clear of all others.
+
+    Boxes go in order, and those that moved count at their new place; where no try is clear, the box stays. A point
+    follows the first target that held it before any moved. Points at the destination stay.
+    """
+    boxes, label, count = scene.truth
+    slots, real = jnp.arange(label.shape[0], dtype=jnp.int32), _real_boxes(scene.truth)
+    target = real & (label >= 0)
+
+    def move(slot: Array, moved: Boxes) -> Boxes:
+        size = jnp.broadcast_to(moved.size[slot], shifts[slot].shape)
+        tries = Boxes(moved.center[slot][None] + shifts[slot], size, moved.yaw[slot] + turns[slot])
+        others = real & (slots != slot)
+        clear = ~jnp.any(footprints_collide(_with_axis(tries, 1), _with_axis(moved, 0)) & others[None], 1)
+        first = jnp.argmax(clear)
+        moves = target[slot] & clear[first]
+        return jax.tree.map(lambda leaf, new: leaf.at[slot].set(jnp.where(moves, new[first], leaf[slot])), moved, tries)
+
+    moved = lax.fori_loop(0, count, move, jax.tree.map(jnp.asarray, boxes))
+    points = scene.cloud.points
+    held = points_in_boxes(points, boxes) & target[:, None] & _real_points(scene)[None]
+    owner = jnp.where(held, slots[:, None], slots.shape[0]).min(0)
+    return scene._replace(
+        cloud=scene.cloud._replace(points=_carry(points, owner, boxes, moved)),
+        truth=scene.truth._replace(boxes=moved),
+    )
+
+
+def _carry(points: Array, owner: Array, before: Boxes, after: Boxes) -> Array:
+    """Points after the move of the box of slot `owner`; without a move they keep their bits."""
+    turn = after.yaw - before.yaw
+    moves = jnp.any(before.center != after.center, 1) | (turn != 0)
+    table = jnp.concatenate([before.center, after.center, jnp.stack([jnp.cos(turn), jnp.sin(turn), moves], 1)], 1)
+    row = jnp.take(table, owner, axis=0, mode="fill", fill_value=0)
+    turned = _turned(points[:, :3] - row[:, :3], row[:, 6], row[:, 7])
+    moved = jnp.concatenate([row[:, 3:6] + turned, points[:, 3:]], 1)
+    return jnp.where(row[:, 8:] > 0, moved, points)
+
+
+def transform_globally(key: jax.Array, scene: Scene, config: AugmentationConfig) -> Scene:
+    """Flip the scene or not, turn it and scale it (SPEC 2.2, steps 6 to 8)."""
+    for_flip, for_angle, for_factor = jax.random.split(key, 3)
+    angle = jax.random.uniform(for_angle, minval=-config.max_rotation, maxval=config.max_rotation)
+    factor = jax.random.uniform(for_factor, minval=config.min_scale, maxval=config.max_scale)
+    scene = flip(scene, jax.random.bernoulli(for_flip, config.flip_probability))
+    return scale(rotate(scene, angle), factor)
+
+
+def flip(scene: Scene, mirrored: Bool[Array, ""]) -> Scene:
+    """Mirror y and yaw where `mirrored`."""
+    sign = jnp.where(mirrored, -1.0, 1.0)
+    (center, size, yaw), points = scene.truth.boxes, scene.cloud.points
+    mirror = jnp.ones(4).at[1].set(sign)[None]
+    return _with_geometry(scene, points * mirror, Boxes(center * mirror[:, :3], size, yaw * sign))
+
+
+def rotate(scene: Scene, angle: Float[Array, ""]) -> Scene:
+    """Turn the scene by `angle` radians about the z axis, counter-clockwise."""
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    (center, size, yaw), points = scene.truth.boxes, scene.cloud.points
+    turned = yaw + jnp.where(_real_boxes(scene.truth), angle, 0)
+    return _with_geometry(scene, _turned(points, cosine, sine), Boxes(_turned(center, cosine, sine), size, turned))
+
+
+def scale(scene: Scene, factor: Float[Array, ""]) -> Scene:
+    """Multiply places and sizes by `factor`."""
+    (center, size, yaw), points = scene.truth.boxes, scene.cloud.points
+    factors = jnp.ones(4).at[:3].set(factor)[None]
+    return _with_geometry(scene, points * factors, Boxes(center * factor, size * factor, yaw))
+
+
+def shuffle_points(key: jax.Array, scene: Scene) -> Scene:
+    """Put the real points into random order; every order is as likely."""
+    points = scene.cloud.points
+    # By two keys: padding stays last.
+    order = jnp.lexsort((jax.random.bits(key, points.shape[:1]), ~_real_points(scene)))
+    return scene._replace(cloud=scene.cloud._replace(points=jnp.take(points, order, axis=0)))
+
+
+def keep_targets(scene: Scene, *, minimum: tuple[float, float, float], maximum: tuple[float, float, float]) -> Scene:
+    """Drop obstacles and targets without a footprint corner strictly inside the range in x and y (SPEC 1.6).
+
+    Scenes that are not augmented need it too. What leaves is not counted in `boxes_cut`: it was no target.
+    """
+    corners = footprint_corners(scene.truth.boxes)
+    low, high = (jnp.array(limit[:2], corners.dtype)[None, None] for limit in (minimum, maximum))
+    seen = jnp.any(jnp.all((corners > low) & (corners < high), -1), -1)
+    kept = _real_boxes(scene.truth) & (scene.truth.label >= 0) & seen
+    return scene._replace(truth=_pick_truth(scene.truth, kept, kept.shape[0]))
+
+
+def _real_points(scene: Scene) -> jax.Array:
+    return jnp.arange(scene.cloud.points.shape[0]) < scene.cloud.count
+
+
+def _real_boxes(truth: GroundTruth) -> jax.Array:
+    return jnp.arange(truth.label.shape[0]) < truth.count
+
+
+def _with_geometry(scene: Scene, points: Array, boxes: Boxes) -> Scene:
+    return scene._replace(cloud=scene.cloud._replace(points=points), truth=scene.truth._replace(boxes=boxes))
+
+
+def _with_axis(boxes: Boxes, axis: int) -> Boxes:
+    return jax.tree.map(lambda leaf: jnp.expand_dims(leaf, axis), boxes)
+
+
+def _turned(points: Array, cosine: Array, sine: Array) -> Array:
+    """Points (x and y first) turned counter-clockwise about the z axis."""
+    x, y = points[:, 0], points[:, 1]
+    return jnp.concatenate([jnp.stack([x * cosine - y * sine, x * sine + y * cosine], 1), points[:, 2:]], 1)
+
+
+def _pick(array: Array, kept: Array, size: int, fill: int = 0) -> Array:
+    """The first `size` kept rows in order, then rows of `fill`."""
+    rows = jnp.flatnonzero(kept, size=size, fill_value=kept.shape[0])
+    return jnp.take(array, rows, axis=0, mode="fill", fill_value=fill)
+
+
+def _pick_truth(truth: GroundTruth, kept: Array, size: int) -> GroundTruth:
+    """The kept boxes; at most `size` of them."""
+    boxes = jax.tree.map(lambda leaf: _pick(leaf, kept, size), truth.boxes)
+    return GroundTruth(boxes, _pick(truth.label, kept, size, fill=-1), kept.sum(dtype=jnp.int32))
