@@ -57,11 +57,11 @@ class Dataset:
 
 
 # An object with so many points inside is easy, moderate, hard where no camera says how large it looks.
-_POINTS_OF_DIFFICULTY = (50, 20, 5)
+_POINTS_OF_DIFFICULTY = (100, 30, 5)
 
 
 def difficulty_by_points(points: Float[np.ndarray, "P C"], boxes: Boxes) -> Int[np.ndarray, " G"]:
-    """Difficulty by the number of points inside a box: 0 from 50, 1 from 20, 2 from 5, else -1."""
+    """Difficulty by the number of points inside a box: 0 from 100, 1 from 30, 2 from 5, else -1."""
     inside = points_in_boxes(points, boxes).sum(-1)
     levels = (inside[:, None] >= np.array(_POINTS_OF_DIFFICULTY)).sum(-1)
     return np.where(levels > 0, len(_POINTS_OF_DIFFICULTY) - levels, -1)

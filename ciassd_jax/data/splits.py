@@ -105,12 +105,6 @@ def present_files(name: str, *, folder: Path, places: Places) -> tuple[Path, ...
     return tuple(path for path in found if path is not None)
 
 
-def find_files(name: str, *, folder: Path, places: Places) -> tuple[Path, ...]:
-    """The files of a frame that are there, one of each kind."""
-    found = (find_file(folder, paths, name) for paths in places.values())
-    return tuple(path for path in found if path is not None)
-
-
 def missing_files(folder: Path, places: Places, names: Sequence[str]) -> list[str]:
     """One sentence without its end for every kind of file that frames lack."""
     sentences = []
