@@ -5,15 +5,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from ciassd_jax.config import Config, GridConfig
 from ciassd_jax.data.check_labels import check_object, check_types, read_labelled
 from ciassd_jax.data.custom import PLACES as CUSTOM_PLACES
-from ciassd_jax.data.findings import Finding, Labelled, Report, TypeSummary
+from ciassd_jax.data.findings import CheckedFrame, Finding, Labelled, Report, TypeSummary
 from ciassd_jax.data.folders import find_root, is_custom
 from ciassd_jax.data.frames import unit_intensity
 from ciassd_jax.data.kitti import IMAGE, crop_without_images, kitti_folder, read_seen_points
@@ -26,16 +25,6 @@ from ciassd_jax.types import Boxes
 
 # A cloud with less than this part of the usual number of points is odd.
 _SPARSE = 0.1
-
-
-class _Checked(NamedTuple):
-    """One frame: what was found, its objects, which of them hold no point, its points and occupied voxels."""
-
-    findings: list[Finding]
-    objects: list[Labelled]
-    empty: Bool[np.ndarray, " G"]
-    points: int
-    voxels: int
 
 
 def check_dataset(
@@ -63,15 +52,14 @@ def check_dataset(
     findings += [] if split else _check_split_files(root)
     if not is_custom(root) and image_size is None and (guess := crop_without_images(folder, names)):
         findings.append(Finding("image size", False, guess))
-    checked = [_check_frame(name, folder, places, config.grid, image_size) for name in track(names)]
-    for frame in checked:
-        findings += frame.findings
-    objects = [labelled for frame in checked for labelled in frame.objects]
-    findings += check_types(objects, config)
-    findings += _check_amounts(names, checked, config)
-    empty = np.concatenate([frame.empty for frame in checked])
-    points, voxels = (tuple(getattr(frame, part) for frame in checked) for part in ("points", "voxels"))
-    return Report(tuple(findings), points, voxels, _summarise(objects, empty, config.grid))
+    frames = []
+    for name in track(names):
+        frame, found = _check_frame(name, folder, places, config.grid, image_size)
+        findings += found
+        frames += [frame] if frame else []
+    findings += check_types([labelled for frame in frames for labelled in frame.objects], config)
+    findings += _check_amounts(frames, config)
+    return Report(tuple(findings), tuple(frames), _summarise(frames, config.grid))
 
 
 def _check_names(names: Sequence[str], source: str, folder: Path, places: Places) -> Iterator[Finding]:
@@ -102,16 +90,15 @@ def _check_split_files(root: Path) -> Iterator[Finding]:
 
 def _check_frame(
     name: str, folder: Path, places: Places, grid: GridConfig, image_size: tuple[int, int] | None
-) -> _Checked:
-    """Everything about one frame whose cloud is there."""
-    nothing = np.zeros(0, bool)
+) -> tuple[CheckedFrame | None, list[Finding]]:
+    """Everything about one frame whose cloud is there; no frame where its cloud or calibration cannot be read."""
     try:
         camera = None
         if "calibration" in places:
             camera = read_camera(folder / f"calib/{name}.txt", folder / IMAGE.format(name), image_size)
         points, findings = _read_cloud(name, folder, places, camera)
     except FormatError as error:
-        return _Checked([Finding("unreadable file", True, str(error))], [], nothing, 0, 0)
+        return None, [Finding("unreadable file", True, str(error))]
     label = find_file(folder, places.get("label", ()), name)
     objects: list[Labelled] = []
     if label is not None:
@@ -119,13 +106,13 @@ def _check_frame(
         findings += more
     findings += [finding for labelled in objects for finding in check_object(labelled)]
     boxes = Boxes.from_array(np.array([labelled.box for labelled in objects]).reshape(-1, 7))
-    empty = np.asarray(points_in_boxes(points, boxes)).sum(-1) == 0
+    inside = np.asarray(points_in_boxes(points, boxes)).sum(-1)
     findings += [
         Finding("no point", False, f"{labelled.place}: no point lies inside this {labelled.type}; check its box.")
-        for labelled, without in zip(objects, empty, strict=True)
-        if without
+        for labelled, count in zip(objects, inside, strict=True)
+        if not count
     ]
-    return _Checked(findings, objects, empty, len(points), _count_voxels(points, grid))
+    return CheckedFrame(name, camera, tuple(objects), inside, len(points), _count_voxels(points, grid)), findings
 
 
 def _read_cloud(
@@ -159,40 +146,43 @@ def _count_voxels(points: Float32[np.ndarray, "P 4"], grid: GridConfig) -> int:
     return len(np.unique(np.ravel_multi_index(tuple(cells[inside].astype(np.int64).T), tuple(shape))))
 
 
-def _check_amounts(names: Sequence[str], checked: Sequence[_Checked], config: Config) -> Iterator[Finding]:
+def _check_amounts(frames: Sequence[CheckedFrame], config: Config) -> Iterator[Finding]:
     """Clouds that are far smaller than usual, and frames beyond a capacity of the config."""
-    usual = float(np.median([frame.points for frame in checked]))
-    for name, frame in zip(names, checked, strict=True):
+    usual = float(np.median([frame.points for frame in frames])) if frames else 0
+    for frame in frames:
         if 0 < frame.points < _SPARSE * usual:
-            text = f"Frame {name}: {frame.points} points where {usual:.0f} are usual; check its cloud."
+            text = f"Frame {frame.name}: {frame.points} points where {usual:.0f} are usual; check its cloud."
             yield Finding("few points", False, text)
     for what, option, capacity, amounts in (
-        ("points", "data.max_points", config.data.max_points, [frame.points for frame in checked]),
-        ("objects", "data.max_boxes", config.data.max_boxes, [len(frame.objects) for frame in checked]),
-        ("occupied voxels", "grid.max_voxels", config.grid.max_voxels, [frame.voxels for frame in checked]),
+        ("points", "data.max_points", config.data.max_points, [frame.points for frame in frames]),
+        ("objects", "data.max_boxes", config.data.max_boxes, [len(frame.objects) for frame in frames]),
+        ("occupied voxels", "grid.max_voxels", config.grid.max_voxels, [frame.voxels for frame in frames]),
     ):
         above = sum(amount > capacity for amount in amounts)
         if above:
-            yield Finding(
-                "capacity",
-                False,
+            text = (
                 f"{above} of {len(amounts)} frames have more than {capacity} {what}, up to {max(amounts)}; the rest is "
-                f"cut and counted, so raise {option} to keep it.",
+                f"cut and counted, so raise {option} to keep it."
             )
+            yield Finding("capacity", False, text)
 
 
-def _summarise(objects: Sequence[Labelled], empty: Bool[np.ndarray, " G"], grid: GridConfig) -> dict[str, TypeSummary]:
+def _summarise(frames: Sequence[CheckedFrame], grid: GridConfig) -> dict[str, TypeSummary]:
     """Objects by type, the most frequent first."""
-    boxes = np.array([labelled.box for labelled in objects]).reshape(-1, 7)
-    types = np.array([labelled.type for labelled in objects])
+    types = np.array([labelled.type for frame in frames for labelled in frame.objects], np.str_)
+    boxes = np.array([labelled.box for frame in frames for labelled in frame.objects]).reshape(-1, 7)
+    inside = np.array([count for frame in frames for count in frame.inside.tolist()])
     center = boxes[:, :3]
     outside = ((center < np.array(grid.minimum)) | (center > np.array(grid.maximum))).sum(-1) > 0
     summaries = {}
     for name in dict.fromkeys(types.tolist()):
         mine = types == name
-        size = np.median(boxes[mine, 3:6], axis=0).tolist()
-        height = float(np.median(boxes[mine, 2]))
+        length, width, height = np.median(boxes[mine, 3:6], axis=0).tolist()
         summaries[name] = TypeSummary(
-            int(mine.sum()), int(outside[mine].sum()), int(empty[mine].sum()), tuple(size), height
+            objects=int(mine.sum()),
+            out_of_range=int(outside[mine].sum()),
+            without_points=int((inside[mine] == 0).sum()),
+            size=(length, width, height),
+            center_z=float(np.median(boxes[mine, 2])),
         )
     return dict(sorted(summaries.items(), key=lambda item: -item[1].objects))

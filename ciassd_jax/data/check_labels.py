@@ -29,7 +29,11 @@ def read_labelled(path: Path, calibration: Calibration | None) -> tuple[list[Lab
         lines = read_lines(path)
     except FormatError as error:
         return [], [Finding("label file", True, str(error))]
+    seen: dict[str, str] = {}
     for place, line in lines:
+        if seen.setdefault(line.strip(), place) != place:
+            text = f"{place}: the same object as in {seen[line.strip()]}; remove one of the two lines."
+            findings.append(Finding("repeated row", True, text))
         try:
             if calibration is None:
                 custom = parse_custom_row(line, place)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int
 
 from ciassd_jax.formats.kitti import ObjectRow
+from ciassd_jax.formats.kitti_camera import Camera
 
 
 class Finding(NamedTuple):
@@ -28,6 +29,17 @@ class Labelled(NamedTuple):
     row: ObjectRow | None
 
 
+class CheckedFrame(NamedTuple):
+    """A frame that could be read: its objects, how many points each of them holds, and the amounts of the cloud."""
+
+    name: str
+    camera: Camera | None
+    objects: tuple[Labelled, ...]
+    inside: Int[np.ndarray, " G"]
+    points: int
+    voxels: int
+
+
 class TypeSummary(NamedTuple):
     """The objects of one type: how many, how many of them out of the grid's range and without any point.
 
@@ -42,11 +54,10 @@ class TypeSummary(NamedTuple):
 
 
 class Report(NamedTuple):
-    """The check of a data set: findings, numbers of points and of occupied voxels per frame, objects by type."""
+    """The check of a data set: what was found, every frame that could be read, and its objects by type."""
 
     findings: tuple[Finding, ...]
-    points: tuple[int, ...]
-    voxels: tuple[int, ...]
+    frames: tuple[CheckedFrame, ...]
     types: dict[str, TypeSummary]
 
     @property
