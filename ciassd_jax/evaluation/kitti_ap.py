@@ -12,20 +12,20 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from ciassd_jax.evaluation.matching import assign, order_candidates, pick_thresholds
+from ciassd_jax.evaluation.matching import Candidates, assign, order_candidates, pick_thresholds
 from ciassd_jax.evaluation.objects import DetectedObjects, FlatObjects, LabelledObjects, flatten, select
 from ciassd_jax.evaluation.overlap import Geometry, Intersections, intersect
 from ciassd_jax.formats.kitti_difficulty import DIFFICULTIES
 
 Metric = Literal["bbox", "bev", "3d", "aos"]
+Recall = Literal["R11", "R40"]
 METRICS: tuple[Metric, ...] = ("bbox", "bev", "3d", "aos")
 # The official and the loose limit of overlap; in the image the official one alone.
 LIMITS = {"Car": (0.7, 0.5), "Pedestrian": (0.5, 0.25), "Cyclist": (0.5, 0.25)}
 _NEIGHBOURS = {"Car": "van", "Pedestrian": "person_sitting", "Cyclist": ""}
 _NO_ALPHA = -10.0
-_VALID, _NEUTRAL, _ABSENT = 0, 1, -1
 # Places in the curve: recall 1/40 to 1 (R40), and 0, 1/10 to 1 of the same curve (R11).
-_RECALL_PLACES = {"R40": slice(1, 41), "R11": slice(0, 41, 4)}
+_RECALL_PLACES: dict[Recall, slice] = {"R40": slice(1, 41), "R11": slice(0, 41, 4)}
 
 
 class Curve(NamedTuple):
@@ -103,85 +103,106 @@ def is_evaluated(detections: FlatObjects, name: str, metric: Metric) -> bool:
 def trace_curve(
     evaluand: Evaluand, name: str, geometry: Geometry, limit: float, level: int, within: Within | None = None
 ) -> Curve:
-    """The curve of a class at one limit of overlap and one level, an index of DIFFICULTIES; overlap must exceed it."""
-    truths, detections, score = evaluand.truths, evaluand.detections, evaluand.detections.score
-    truth_status = _truth_status(truths, name, level, within)
-    status = _detection_status(detections, name, level)
-    pairs = evaluand.shared[geometry]
-    overlap = pairs.overlap
-    kept = (overlap > limit) & (truth_status[pairs.first] != _ABSENT) & (status[pairs.second] != _ABSENT)
-    first, second, overlap = pairs.first[kept], pairs.second[kept], overlap[kept]
-    num_truths = int((truth_status == _VALID).sum())
+    """The curve of a class at one limit of overlap and one level, an index of DIFFICULTIES; overlap must exceed it.
 
-    best_score = order_candidates(first, second, truths.frame[first], (-score[second],))
-    chosen, _ = assign(best_score, np.ones((1, len(first)), bool), len(score))
-    hit = chosen[0] & (truth_status[best_score.truth] == _VALID) & (status[best_score.detection] == _VALID)
-    thresholds = pick_thresholds(score[best_score.detection[hit]], num_truths)
+    A first pass without thresholds gives each object its best score, and the hits' scores give the thresholds; at
+    each of them the second gives it the best overlap, and the first neutral detection only where there is no valid.
+    """
+    case = _state_case(evaluand, name, geometry, limit, level, within)
+    every = np.array([-np.inf])
+    best_scored = _match(case, every, (-case.score[case.second],))
+    num_truths = int(case.valid_truths.sum())
+    hit_scores = case.score[best_scored.candidates.detection[best_scored.hits[0]]]
+    thresholds = pick_thresholds(hit_scores, num_truths)
 
-    neutral = status[second] == _NEUTRAL
-    best_overlap = order_candidates(first, second, truths.frame[first], (neutral, np.where(neutral, 0, -overlap)))
-    visible = score[best_overlap.detection] >= thresholds[:, None]
-    chosen, taken = assign(best_overlap, visible, len(score))
-    found = chosen & (truth_status[best_overlap.truth] == _VALID)
-    hits = found & (status[best_overlap.detection] == _VALID)
-    true = hits.sum(1)
-    false = _count_false(
-        evaluand,
-        geometry,
-        limit,
-        (status == _VALID) & (True if within is None else within.detections),
-        thresholds,
-        taken,
-    )
-    turn = truths.alpha[best_overlap.truth] - detections.alpha[best_overlap.detection]
-    similarity = np.where(hits, (1 + np.cos(turn)) / 2, 0).sum(1)
-    return Curve(
-        num_truths,
-        thresholds,
-        true,
-        false,
-        num_truths - found.sum(1),
-        similarity,
-        _envelope(true, true + false),
-        _envelope(similarity, true + false),
-    )
+    neutral = ~case.valid_detections[case.second]
+    match = _match(case, thresholds, (neutral, np.where(neutral, 0, -case.overlap)))
+    true = match.hits.sum(1)
+    countable = np.flatnonzero(case.countable)
+    false = ((case.score[countable] >= thresholds[:, None]) & ~match.taken[:, countable]).sum(1)
+    turn = evaluand.truths.alpha[match.candidates.truth] - evaluand.detections.alpha[match.candidates.detection]
+    similarity = np.where(match.hits, (1 + np.cos(turn)) / 2, 0).sum(1)
+    precision, orientation = (_envelope(value, true + false) for value in (true, similarity))
+    missed = num_truths - match.found.sum(1)
+    return Curve(num_truths, thresholds, true, false, missed, similarity, precision, orientation)
 
 
-def average_precision(curve: Float64[np.ndarray, " 41"], recall: Literal["R11", "R40"] = "R40") -> float:
+def trace_levels(
+    evaluand: Evaluand, name: str, geometry: Geometry, limit: float, within: Within | None = None
+) -> tuple[Curve, ...]:
+    """The curves of all levels of difficulty."""
+    levels = range(len(DIFFICULTIES))
+    return tuple(trace_curve(evaluand, name, geometry, limit, level, within) for level in levels)
+
+
+def average_precision(curve: Float64[np.ndarray, " 41"], recall: Recall = "R40") -> float:
     """Mean of a Curve's `precision` or `orientation`, in percent, over the recalls 1/40 to 1 or 0, 1/10 to 1."""
     return 100 * float(curve[_RECALL_PLACES[recall]].mean())
 
 
-def _truth_status(truths: FlatObjects, name: str, level: int, within: Within | None) -> Int[np.ndarray, " G"]:
+class _Case(NamedTuple):
+    """Who counts in one curve, and the E pairs of labels and detections that may match.
+
+    What is not valid among the pairs is neutral. `countable` detections are false where nothing takes them.
+    """
+
+    valid_truths: Bool[np.ndarray, " G"]
+    valid_detections: Bool[np.ndarray, " D"]
+    countable: Bool[np.ndarray, " D"]
+    score: Float64[np.ndarray, " D"]
+    first: Int[np.ndarray, " E"]
+    second: Int[np.ndarray, " E"]
+    overlap: Float64[np.ndarray, " E"]
+    frame: Int[np.ndarray, " E"]
+
+
+class _Match(NamedTuple):
+    """At each threshold the pairs of valid objects, those of them that are hits, and the detections taken."""
+
+    candidates: Candidates
+    found: Bool[np.ndarray, "T E"]
+    hits: Bool[np.ndarray, "T E"]
+    taken: Bool[np.ndarray, "T D"]
+
+
+def _state_case(
+    evaluand: Evaluand, name: str, geometry: Geometry, limit: float, level: int, within: Within | None
+) -> _Case:
+    truths, detections = evaluand.truths, evaluand.detections
     same = truths.types == name.lower()
-    admitted = same & (truths.difficulty >= 0) & (truths.difficulty <= level)
-    if within is not None:
-        admitted &= within.truths
-    neighbour = truths.types == _NEIGHBOURS[name]
-    return np.where(admitted, _VALID, np.where(same | neighbour, _NEUTRAL, _ABSENT))
-
-
-def _detection_status(detections: FlatObjects, name: str, level: int) -> Int[np.ndarray, " D"]:
+    valid_truths = same & (truths.difficulty >= 0) & (truths.difficulty <= level)
     height = np.abs(detections.image_boxes[:, 3] - detections.image_boxes[:, 1])
     # The height comes before the class, and without a camera no detection is too low: NaN compares false.
     low = height < DIFFICULTIES[level].min_height
-    return np.where(low, _NEUTRAL, np.where(detections.types == name.lower(), _VALID, _ABSENT))
-
-
-def _count_false(
-    evaluand: Evaluand,
-    geometry: Geometry,
-    limit: float,
-    countable: Bool[np.ndarray, " D"],
-    thresholds: Float64[np.ndarray, " T"],
-    taken: Bool[np.ndarray, "T D"],
-) -> Int[np.ndarray, " T"]:
-    """Visible detections that nothing took and no DontCare area excuses."""
+    of_class = detections.types == name.lower()
     areas = evaluand.dont_care[geometry]
-    excused = np.zeros(len(countable), bool)
-    excused[areas.second[areas.coverage > limit]] = True
-    index = np.flatnonzero(countable & ~excused)
-    return ((evaluand.detections.score[index] >= thresholds[:, None]) & ~taken[:, index]).sum(1)
+    countable = of_class & ~low
+    countable[areas.second[areas.coverage > limit]] = False
+    if within is not None:
+        valid_truths &= within.truths
+        countable &= within.detections
+    pairs = evaluand.shared[geometry]
+    present_truths, present = same | (truths.types == _NEIGHBOURS[name]), of_class | low
+    kept = np.flatnonzero((pairs.overlap > limit) & present_truths[pairs.first] & present[pairs.second])
+    first, second = pairs.first[kept], pairs.second[kept]
+    return _Case(
+        valid_truths,
+        of_class & ~low,
+        countable,
+        detections.score,
+        first,
+        second,
+        pairs.overlap[kept],
+        truths.frame[first],
+    )
+
+
+def _match(case: _Case, thresholds: Float64[np.ndarray, " T"], preference: tuple[np.ndarray, ...]) -> _Match:
+    candidates = order_candidates(case.first, case.second, case.frame, preference)
+    visible = case.score[candidates.detection] >= thresholds[:, None]
+    chosen, taken = assign(candidates, visible, len(case.score))
+    found = chosen & case.valid_truths[candidates.truth]
+    return _Match(candidates, found, found & case.valid_detections[candidates.detection], taken)
 
 
 def _envelope(value: np.ndarray, total: Int[np.ndarray, " T"]) -> Float64[np.ndarray, " 41"]:

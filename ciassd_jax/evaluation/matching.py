@@ -19,7 +19,7 @@ class Candidates(NamedTuple):
     truth: Int[np.ndarray, " E"]
     detection: Int[np.ndarray, " E"]
     start: Int[np.ndarray, " S"]
-    round: Int[np.ndarray, " R"]  # type: ignore[assignment]
+    round: Int[np.ndarray, " R"]
 
 
 def order_candidates(

@@ -12,8 +12,6 @@ from ciassd_jax.formats.kitti import ObjectRow
 from ciassd_jax.formats.kitti_difficulty import difficulty_of
 from ciassd_jax.types import Boxes
 
-# Fewest points in the box of an easy, moderate and hard object, for data without a camera.
-DIFFICULTY_POINTS = (100, 30, 5)
 # What KITTI writes for a location that is not given.
 _NO_LOCATION = -1000.0
 
@@ -77,12 +75,6 @@ def detections_from_rows(rows: Sequence[ObjectRow]) -> DetectedObjects:
     return DetectedObjects(tuple(row.type for row in rows), score, *_geometry(rows))
 
 
-def difficulty_by_points(points: Int[np.ndarray, " G"]) -> Int[np.ndarray, " G"]:
-    """Difficulty of objects that no camera has seen: the first of DIFFICULTY_POINTS that they reach, -1 for none."""
-    reached = points[:, None] >= np.array(DIFFICULTY_POINTS)
-    return np.where(reached.any(1), reached.argmax(1), -1)
-
-
 def flatten(frames: Sequence[LabelledObjects] | Sequence[DetectedObjects]) -> FlatObjects:
     """Join frames; raises ValueError if only some of them have a camera or points."""
     sizes = [len(frame.types) for frame in frames]
@@ -103,7 +95,7 @@ def flatten(frames: Sequence[LabelledObjects] | Sequence[DetectedObjects]) -> Fl
 def select(objects: FlatObjects, index: np.ndarray) -> FlatObjects:
     """The objects at an index or mask."""
     boxes = Boxes(*(leaf[index] for leaf in objects.boxes))
-    return FlatObjects(*(boxes if field is objects.boxes else field[index] for field in objects))
+    return FlatObjects._make(boxes if field is objects.boxes else field[index] for field in objects)
 
 
 def _geometry(

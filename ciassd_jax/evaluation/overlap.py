@@ -45,16 +45,16 @@ def intersect(a: FlatObjects, b: FlatObjects) -> dict[Geometry, Intersections]:
     image = _image_intersections(a.image_boxes, b.image_boxes, first, second)
     near = _near(a.boxes, b.boxes, first, second)
     first, second = first[near], second[near]
-    one, other = (Boxes(*(leaf[index] for leaf in boxes)) for boxes, index in ((a.boxes, first), (b.boxes, second)))
-    footprint = intersection_bev(_unsigned(one), _unsigned(other))
-    area, other_area = (np.abs(boxes.size[:, 0] * boxes.size[:, 1]) for boxes in (one, other))
-    top = np.minimum(*(boxes.center[:, 2] + boxes.size[:, 2] / 2 for boxes in (one, other)))
-    bottom = np.maximum(*(boxes.center[:, 2] - boxes.size[:, 2] / 2 for boxes in (one, other)))
-    volume = footprint * np.where(top > bottom, top - bottom, 0)
+    footprint = intersection_bev(_footprints(a.boxes, first), _footprints(b.boxes, second))
+    height = np.minimum(_top(a.boxes)[first], _top(b.boxes)[second])
+    height -= np.maximum(_bottom(a.boxes)[first], _bottom(b.boxes)[second])
+    volume = footprint * np.where(height > 0, height, 0)
+    area, other_area = np.abs(a.boxes.size[:, :2]).prod(1), np.abs(b.boxes.size[:, :2]).prod(1)
+    size, other_size = area * a.boxes.size[:, 2], other_area * b.boxes.size[:, 2]
     return {
         "bbox": image,
-        "bev": _shared_only(first, second, footprint, area, other_area),
-        "3d": _shared_only(first, second, volume, area * one.size[:, 2], other_area * other.size[:, 2]),
+        "bev": _shared_only(first, second, np.asarray(footprint), area[first], other_area[second]),
+        "3d": _shared_only(first, second, np.asarray(volume), size[first], other_size[second]),
     }
 
 
@@ -90,8 +90,16 @@ def _near(a: Boxes, b: Boxes, first: Int[np.ndarray, " E"], second: Int[np.ndarr
     return np.flatnonzero(distance <= radius[first] + other_radius[second])
 
 
-def _unsigned(boxes: Boxes) -> Boxes:
-    return boxes._replace(size=np.abs(boxes.size))
+def _footprints(boxes: Boxes, index: Int[np.ndarray, " E"]) -> Boxes:
+    return Boxes(boxes.center[index], np.abs(boxes.size[index]), boxes.yaw[index])
+
+
+def _top(boxes: Boxes) -> np.ndarray:
+    return np.asarray(boxes.center[:, 2] + boxes.size[:, 2] / 2)
+
+
+def _bottom(boxes: Boxes) -> np.ndarray:
+    return np.asarray(boxes.center[:, 2] - boxes.size[:, 2] / 2)
 
 
 def _shared_only(

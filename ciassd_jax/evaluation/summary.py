@@ -1,0 +1,71 @@
+"""The whole evaluation of a set in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ciassd_jax.evaluation.breakdown import Row, correlation, rows_by_distance, rows_by_points
+from ciassd_jax.evaluation.kitti_ap import (
+    LIMITS,
+    METRICS,
+    Curve,
+    Metric,
+    Recall,
+    average_precision,
+    is_evaluated,
+    prepare,
+    trace_levels,
+)
+from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects
+
+
+class Evaluation(NamedTuple):
+    """What `evaluate` finds.
+
+    `curves` holds the easy, moderate and hard curve for every class, metric and limit, or None where the official
+    program evaluates nothing; those of aos are those of bbox, whose `orientation` counts. `by_points` is empty where
+    the numbers are not known. `correlation` is that of score and 3D overlap by class, NaN where there is none.
+    Without a camera there is neither bbox nor aos, and difficulty is not KITTI's.
+    """
+
+    num_frames: int
+    has_camera: bool
+    curves: dict[tuple[str, Metric, float], tuple[Curve, ...] | None]
+    by_distance: list[Row]
+    by_points: list[Row]
+    correlation: dict[str, float]
+
+    def precision(self, name: str, metric: Metric, limit: float, recall: Recall = "R40") -> list[float] | None:
+        """AP in percent, easy, moderate and hard; None where nothing is evaluated, NaN for zero over zero."""
+        curves = self.curves[name, metric, limit]
+        if curves is None:
+            return None
+        return [average_precision(c.orientation if metric == "aos" else c.precision, recall) for c in curves]
+
+
+def evaluate(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObjects]) -> Evaluation:
+    """Evaluate detections by KITTI's official rules; both lists hold one record per frame, in the same order.
+
+    Frames of KITTI come from `labels_from_rows` and `detections_from_rows`. Data without a camera gives records of
+    its own boxes and its own difficulty, with neither image boxes nor alpha: no detection is too low then.
+    Raises ValueError for lists that do not fit together.
+    """
+    evaluand = prepare(truths, detections)
+    curves: dict[tuple[str, Metric, float], tuple[Curve, ...] | None] = {}
+    for name, limits in LIMITS.items():
+        for metric in METRICS:
+            geometry = "bbox" if metric == "aos" else metric
+            for limit in limits if metric in ("bev", "3d") else limits[:1]:
+                traced = None
+                if is_evaluated(evaluand.detections, name, metric):
+                    traced = curves.get((name, geometry, limit)) or trace_levels(evaluand, name, geometry, limit)
+                curves[name, metric, limit] = traced
+    return Evaluation(
+        len(truths),
+        evaluand.has_camera,
+        curves,
+        rows_by_distance(evaluand),
+        rows_by_points(evaluand),
+        {name: correlation(evaluand, name) for name in LIMITS},
+    )
