@@ -12,7 +12,19 @@ LAYERS = [
     {"types", "config", "presets"},
     {"ops", "formats"},
     {"model", "anchors", "detections", "data", "evaluation"},
-    {"prediction", "weights", "detector", "export", "info", "predict_files", "demo", "view", "cli"},
+    {
+        "prediction",
+        "weights",
+        "detector",
+        "export",
+        "info",
+        "predict_files",
+        "check",
+        "submission",
+        "demo",
+        "view",
+        "cli",
+    },
 ]
 SIBLINGS = {("prediction", "weights"), ("weights", "prediction")}
 MODULES = sorted(PACKAGE.rglob("*.py"))

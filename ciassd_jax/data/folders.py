@@ -35,6 +35,11 @@ def find_root(root: Pathlike | None) -> Path:
     return folder
 
 
+def database_path(folder: Path, split: str) -> Path:
+    """The file of a split's ground-truth database."""
+    return folder / f"objects_{split}.bin"
+
+
 def is_custom(root: Path) -> bool:
     """Whether the folder has OpenPCDet's custom layout."""
     return (root / "points").is_dir()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +16,8 @@ from ciassd_jax.formats.errors import FormatError, FormatWarning
 from ciassd_jax.formats.kitti import ObjectRow, read_rows, rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera, read_camera, view_planes
 from ciassd_jax.formats.kitti_difficulty import difficulty_of
-from ciassd_jax.formats.points import read_points
+from ciassd_jax.formats.points import read_points, write_bin
+from ciassd_jax.formats.writing import replacing
 from ciassd_jax.ops.camera import inside_planes
 
 REDUCED, FULL = "velodyne_reduced/{}.bin", "velodyne/{}.bin"
@@ -82,6 +83,24 @@ def read_seen_points(folder: Path, name: str, camera: Camera) -> Float32[np.ndar
 def crop_to_view(points: Float32[np.ndarray, "N 4"], camera: Camera) -> Float32[np.ndarray, "P 4"]:
     """The points that the camera sees, strictly inside the image and nearer than 100 m (SPEC 1.3)."""
     return points[inside_planes(points[:, :3].astype(np.float64), view_planes(camera))]
+
+
+def write_reduced(
+    root: Path, image_size: tuple[int, int] | None, track: Callable[[Sequence[Path]], Iterable[Path]] = iter
+) -> int:
+    """Write `velodyne_reduced` beside every full cloud that lacks it; returns how many were written.
+
+    `track` sees the clouds go by, for a progress bar. Raises FormatError for a file that cannot be read or written.
+    """
+    full = sorted(path for part in ("training", "testing") for path in (root / part).glob(FULL.format("*")))
+    clouds = [path for path in full if not (path.parents[1] / REDUCED.format(path.stem)).is_file()]
+    for path in track(clouds):
+        folder, name = path.parents[1], path.stem
+        camera = read_camera(folder / f"calib/{name}.txt", folder / IMAGE.format(name), image_size)
+        points = crop_to_view(read_points(path), camera)
+        with replacing(folder / REDUCED.format(name)) as temporary:
+            write_bin(temporary, points)
+    return len(clouds)
 
 
 def crop_without_images(folder: Path, names: Sequence[str]) -> str | None:

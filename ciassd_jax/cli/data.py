@@ -1,0 +1,166 @@
+"""Commands around a data set: data check, data prepare, submit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import tyro
+
+from ciassd_jax.cli.inference import Preset
+from ciassd_jax.cli.messages import warnings_as_lines
+from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.presets import PRESETS
+
+if TYPE_CHECKING:
+    from ciassd_jax.data.findings import Finding, Report
+
+Item = TypeVar("Item")
+Root = Annotated[Path | None, tyro.conf.Positional]
+
+
+@dataclass(frozen=True)
+class Check:
+    """Read a whole data set and say what is missing or odd; exit code 1 if something must be mended."""
+
+    root: Root = None
+    """Folder in KITTI's or OpenPCDet's custom layout; KITTI_ROOT without it."""
+    split: str | None = None
+    """train, val, trainval, test or a file of ImageSets; without it every frame and all split files."""
+    preset: Preset = "car"
+    """Its grid, classes and capacities are what the data are checked against."""
+    image_size: tuple[int, int] | None = None
+    """Width and height of the images in pixels, for cameras that KITTI does not have."""
+    most: int = 10
+    """So many findings of a kind are listed, the others counted."""
+
+    def run(self) -> int:
+        from ciassd_jax.data.check import check_dataset
+
+        config = PRESETS[self.preset]()
+        report = check_dataset(self.root, self.split, config=config, image_size=self.image_size, track=_progress)
+        for line in _listing(report.findings, self.most):
+            print(line)
+        print(_table(report))
+        serious = sum(finding.serious for finding in report.findings)
+        print(f"{serious} findings must be mended, {len(report.findings) - serious} are worth a look.")
+        return 0 if report.good else 1
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Build the ground-truth database that training pastes objects from."""
+
+    root: Root = None
+    """Folder in KITTI's or OpenPCDet's custom layout; KITTI_ROOT without it."""
+    split: str = "train"
+    """The frames whose objects are collected."""
+    out: Path | None = None
+    """Folder for the database; the data set's own without it."""
+    reduce: bool = False
+    """First write every full cloud of a KITTI folder, cropped to the camera's view, to velodyne_reduced beside it."""
+    image_size: tuple[int, int] | None = None
+    """Width and height of the images in pixels, for cameras that KITTI does not have."""
+
+    def run(self) -> int:
+        from ciassd_jax.data.folders import database_path, find_root, is_custom, open_dataset
+        from ciassd_jax.data.kitti import write_reduced
+        from ciassd_jax.data.paste import build_database
+        from ciassd_jax.formats.writing import check_folder
+
+        root = find_root(self.root)
+        path = database_path(self.out or root, self.split)
+        check_folder(path.parent)
+        with warnings_as_lines(root):
+            if self.reduce:
+                if is_custom(root):
+                    raise FormatError(f"{root} has no camera to crop clouds to; leave out --reduce.")
+                print(f"Wrote {write_reduced(root, self.image_size, _progress)} cropped clouds.")
+            dataset = open_dataset(root, self.split, self.image_size)
+            build_database(dataset, path, _progress)
+        print(f"Wrote the objects of {len(dataset)} frames to {path}.")
+        return 0
+
+
+@dataclass(frozen=True)
+class Data:
+    """Check and prepare a data set."""
+
+    action: Annotated[
+        Annotated[Check, tyro.conf.subcommand("check", prefix_name=False)]
+        | Annotated[Prepare, tyro.conf.subcommand("prepare", prefix_name=False)],
+        tyro.conf.arg(name=""),
+    ]
+
+    def run(self) -> int:
+        return self.action.run()
+
+
+@dataclass(frozen=True)
+class Submit:
+    """Check the results of KITTI's 7518 test frames and zip them for its server; exit code 1 for bad ones."""
+
+    results: Annotated[Path, tyro.conf.Positional]
+    """Folder of NNNNNN.txt, one for every test frame, empty where nothing was detected."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """The archive to write: OUT.zip."""
+
+    def run(self) -> int:
+        from ciassd_jax.formats.writing import check_folder
+        from ciassd_jax.submission import check_results, write_submission
+
+        if self.out.suffix != ".zip":
+            raise FormatError(f"{self.out} must end in .zip; name the archive so.")
+        if not self.results.is_dir():
+            raise FormatError(f"{self.results} is no folder; name the one that holds the results.")
+        check_folder(self.out.parent)
+        problems = check_results(self.results)
+        for problem in problems:
+            print(problem)
+        if problems:
+            print(f"{len(problems)} problems; {self.out} was not written.")
+            return 1
+        print(f"Wrote {self.out} with {write_submission(self.results, self.out)} files.")
+        return 0
+
+
+def _progress(items: Sequence[Item]) -> Iterable[Item]:
+    from tqdm.auto import tqdm
+
+    return tqdm(items, unit="frame", leave=False)
+
+
+def _listing(findings: Sequence[Finding], most: int) -> list[str]:
+    """Serious findings first, of each kind at most so many; the others of the kind in one line."""
+    lines = []
+    for serious, word in ((True, "error"), (False, "odd")):
+        kinds: dict[str, list[str]] = {}
+        for finding in findings:
+            if finding.serious == serious:
+                kinds.setdefault(finding.kind, []).append(finding.text)
+        for kind, texts in kinds.items():
+            lines += [f"{word}: {text}" for text in texts[:most]]
+            if len(texts) > most:
+                lines.append(f"{word}: ... and {len(texts) - most} more of this kind ({kind}); --most lists more.")
+    return lines
+
+
+def _table(report: Report) -> str:
+    """Amounts per frame and objects by type."""
+    import numpy as np
+
+    rows = [f"{len(report.frames)} frames       least   median     most"]
+    for what in ("points", "voxels"):
+        amounts = [getattr(frame, what) for frame in report.frames] or [0]
+        least, median, most = np.quantile(amounts, (0, 0.5, 1), method="nearest").tolist()
+        rows.append(f"{what:<12} {least:>9} {median:>8} {most:>8}")
+    rows.append("type             objects  out of range  without points  length   width  height  centre z (medians, m)")
+    for name, row in report.types.items():
+        length, width, height = row.size
+        rows.append(
+            f"{name:<15} {row.objects:>8} {row.out_of_range:>13} {row.without_points:>15}"
+            f"  {length:>6.2f}  {width:>6.2f}  {height:>6.2f}  {row.center_z:>8.2f}"
+        )
+    return "\n".join(rows)
