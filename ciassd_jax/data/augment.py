@@ -29,8 +29,9 @@ def augment(key: jax.Array, scene: Scene, objects: PasteObjects, config: Config)
     """
     switches = config.data.augmentation
     for_noise, for_transform, for_order = jax.random.split(key, 3)
-    if switches.paste:
-        scene = paste_objects(scene, objects, paste_up_to=tuple(one.paste_up_to for one in config.classes))
+    paste_up_to = tuple(one.paste_up_to for one in config.classes)
+    if switches.paste and any(paste_up_to):
+        scene = paste_objects(scene, objects, paste_up_to=paste_up_to)
     if switches.object_noise:
         scene = add_object_noise(for_noise, scene, switches)
     if switches.global_transform:
@@ -42,8 +43,8 @@ def augment(key: jax.Array, scene: Scene, objects: PasteObjects, config: Config)
 def paste_objects(scene: Scene, objects: PasteObjects, *, paste_up_to: tuple[int, ...]) -> Scene:
     """Add the objects that collide with nothing, their points first; scene points inside them leave (SPEC 2.2, 2.3).
 
-    `paste_up_to` is the number of slots of one round for every class. What finds no room is counted: an object
-    without a free box is not pasted, and points are cut from the end of the scene's.
+    `paste_up_to` is the number of slots of one round for every class, not all 0. What finds no room is counted: an
+    object without a free box is not pasted, and points are cut from the end of the scene's.
     """
     accepted = accept_objects(scene.truth, objects, paste_up_to=paste_up_to)
     pasted = accepted & (scene.truth.count + jnp.cumsum(accepted) <= scene.truth.label.shape[0])

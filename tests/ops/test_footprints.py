@@ -51,8 +51,8 @@ def test_touching_is_no_collision(yaw, along, across):
     """The shift is along x and y; at a quarter turn, two squares."""
     size = [4.0, 2.0, 1.0] if yaw == 0 else [2.0, 2.0, 1.0]
     a = np.array([[20, 5, 0, *size, 0.0]])
-    b = a + [[along * size[0], across * size[1], 0, 0, 0, 0, yaw]]
-    nearer = b - [[along * 1e-3, across * 1e-3, 0, 0, 0, 0, 0]]
+    b = a + np.array([along * size[0], across * size[1], 0, 0, 0, 0, yaw])
+    nearer = b - np.array([along * 1e-3, across * 1e-3, 0, 0, 0, 0, 0])
     # A quarter turn has a cosine of 6e-17 (float32: 4e-8) only.
     slack = np.array([[0, 0, 0, 1e-5, 1e-5, 0, 0]]) if yaw else 0
     assert not any(result.any() for result in collisions(a - slack, b))
