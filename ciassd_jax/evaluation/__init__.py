@@ -1,1 +1,19 @@
 """Evaluation by KITTI's official rules: NumPy in float64, without a device."""
+
+from ciassd_jax.evaluation.folders import read_folders
+from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
+from ciassd_jax.evaluation.report import format_block, format_tables, to_json
+from ciassd_jax.evaluation.summary import Evaluation, evaluate
+
+__all__ = [
+    "DetectedObjects",
+    "Evaluation",
+    "LabelledObjects",
+    "detections_from_rows",
+    "evaluate",
+    "format_block",
+    "format_tables",
+    "labels_from_rows",
+    "read_folders",
+    "to_json",
+]

@@ -1,0 +1,128 @@
+"""An evaluation as text and as JSON: the block that the field's scripts parse, and tables for the eye."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from ciassd_jax.evaluation.breakdown import Row
+from ciassd_jax.evaluation.kitti_ap import LIMITS, METRICS, Metric, Recall, average_precision
+from ciassd_jax.evaluation.summary import Evaluation
+from ciassd_jax.formats.kitti_difficulty import DIFFICULTIES
+
+# By class, metric, R11 or R40, and limit of overlap.
+Precisions = dict[str, dict[str, dict[str, dict[str, list[float | None] | None]]]]
+
+_RECALLS: tuple[Recall, ...] = ("R11", "R40")
+# Fewer objects leave points of the curve at zero, whatever the detector does.
+_ENOUGH_OBJECTS = 41
+_LEVELS = "".join(f"{level.name:>10}" for level in DIFFICULTIES)
+
+
+def to_json(evaluation: Evaluation) -> Precisions:
+    """AP in percent as {"Car": {"3d": {"R40": {"0.70": [easy, moderate, hard]}}}}.
+
+    Every class, metric (bbox, bev, 3d, aos), R11 and R40 and limit of overlap is there: None where the official
+    program evaluates nothing, None in a list where its value is not a number.
+    """
+    result: Precisions = {}
+    for name, metric, limit in evaluation.curves:
+        for recall in _RECALLS:
+            values = evaluation.precision(name, metric, limit, recall)
+            by_limit = result.setdefault(name, {}).setdefault(metric, {}).setdefault(recall, {})
+            numbers = None if values is None else [None if math.isnan(value) else value for value in values]
+            by_limit[f"{limit:.2f}"] = numbers
+    return result
+
+
+def format_block(evaluation: Evaluation) -> str:
+    """The block that other toolboxes print and scripts parse; a class without detections has none in it."""
+    lines = []
+    for name, limits in LIMITS.items():
+        if all(evaluation.curves[name, metric, limits[0]] is None for metric in METRICS):
+            continue
+        for limit in limits:
+            for recall in _RECALLS:
+                title = "AP" if recall == "R11" else "AP_R40"
+                lines.append(f"{name} {title}@{limits[0]:.2f}, {limit:.2f}, {limit:.2f}:")
+                lines += _block_lines(evaluation, name, limit, recall)
+    return "\n".join(lines)
+
+
+def format_tables(evaluation: Evaluation) -> str:
+    """Tables of AP, of the parts by distance and by points, of the correlation, and what to know of them."""
+    parts = [_main_table(evaluation)]
+    for title, rows in (("distance", evaluation.by_distance), ("number of points", evaluation.by_points)):
+        if rows:
+            parts.append("\n".join([f"By {title}, AP (R40)", _HEAD_OF_PARTS, *map(_part_line, rows)]))
+    known = [f"{name} {value:.3f}" for name, value in evaluation.correlation.items() if not math.isnan(value)]
+    if known:
+        parts.append(f"Correlation (PCC) of confidence and 3D overlap: {', '.join(known)}.")
+    return "\n\n".join(parts + list(_notes(evaluation)))
+
+
+_HEAD = f"{'class':<12}{'metric':<8}{'overlap':>7}" + f"{'R40':>6}{_LEVELS}{'R11':>6}{_LEVELS}"
+_HEAD_OF_PARTS = f"{'class':<12}{'metric':<8}{'part':>14}{_LEVELS}{'objects':>10}{_LEVELS}"
+
+
+def _block_lines(evaluation: Evaluation, name: str, limit: float, recall: Recall) -> Iterable[str]:
+    official = LIMITS[name][0]
+    for metric in METRICS:
+        values = evaluation.precision(name, metric, limit if metric in ("bev", "3d") else official, recall)
+        # The field's programs leave out orientation where it is off, and only that.
+        if values is not None or metric != "aos":
+            shown = ", ".join(f"{value:.4f}" for value in values or [math.nan] * len(DIFFICULTIES))
+            yield f"{metric:<4} AP:{shown}"
+
+
+def _main_table(evaluation: Evaluation) -> str:
+    lines = [f"AP in percent by KITTI's rules, frames: {evaluation.num_frames}", _HEAD]
+    for name, limits in LIMITS.items():
+        rows = [
+            _main_line(evaluation, name, metric, limit)
+            for limit in limits
+            for metric in METRICS
+            if evaluation.curves.get((name, metric, limit)) is not None
+        ]
+        lines += rows or [f"{name:<12}not evaluated, as there are no detections of it"]
+    return "\n".join(lines)
+
+
+def _main_line(evaluation: Evaluation, name: str, metric: Metric, limit: float) -> str:
+    r40, r11 = (_columns(evaluation.precision(name, metric, limit, recall) or []) for recall in ("R40", "R11"))
+    return f"{name:<12}{metric:<8}{limit:>7.2f}{'':6}{r40}{'':6}{r11}"
+
+
+def _part_line(row: Row) -> str:
+    # A part without objects has no AP rather than one of 0.
+    values = [average_precision(curve.precision) if curve.num_truths else math.nan for curve in row.curves]
+    counts = "".join(f"{curve.num_truths:>10}" for curve in row.curves)
+    return f"{row.name:<12}{row.geometry:<8}{row.part:>14}{_columns(values)}{'':10}{counts}"
+
+
+def _columns(values: Iterable[float]) -> str:
+    return "".join(f"{'-' if math.isnan(value) else f'{value:.2f}':>10}" for value in values)
+
+
+def _notes(evaluation: Evaluation) -> Iterable[str]:
+    if not evaluation.has_camera:
+        yield (
+            "No camera: difficulty is by the number of points in an object's box, no detection is too low, and bbox "
+            "and aos are not evaluated; these are not KITTI's numbers."
+        )
+    elif all(evaluation.curves[name, "aos", limits[0]] is None for name, limits in LIMITS.items()):
+        yield "Orientation (aos) is not evaluated, as a detection has alpha -10 or none is in the image."
+    if not evaluation.by_points:
+        yield "Nothing by number of points, as the points in the boxes are not known here."
+    if min(_counts(evaluation), default=_ENOUGH_OBJECTS) < _ENOUGH_OBJECTS:
+        yield (
+            f"By the official rule n objects fill n points of the curve, so that fewer than {_ENOUGH_OBJECTS} cannot "
+            "reach 100 by R40."
+        )
+
+
+def _counts(evaluation: Evaluation) -> Iterable[int]:
+    """Numbers of objects behind all that the tables show."""
+    shown = [curves for curves in evaluation.curves.values() if curves is not None]
+    shown += [row.curves for row in evaluation.by_distance + evaluation.by_points]
+    return (curve.num_truths for curves in shown for curve in curves)
