@@ -15,6 +15,7 @@ from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.presets import PRESETS
 
 if TYPE_CHECKING:
+    from ciassd_jax.check import PerfectScore
     from ciassd_jax.data.findings import Finding, Report
 
 Item = TypeVar("Item")
@@ -37,16 +38,18 @@ class Check:
     """So many findings of a kind are listed, the others counted."""
 
     def run(self) -> int:
+        from ciassd_jax.check import find_imperfect, score_truth
         from ciassd_jax.data.check import check_dataset
 
         config = PRESETS[self.preset]()
         report = check_dataset(self.root, self.split, config=config, image_size=self.image_size, track=_progress)
-        for line in _listing(report.findings, self.most):
-            print(line)
-        print(_table(report))
-        serious = sum(finding.serious for finding in report.findings)
-        print(f"{serious} findings must be mended, {len(report.findings) - serious} are worth a look.")
-        return 0 if report.good else 1
+        scores = score_truth(report.frames)
+        findings = [*report.findings, *find_imperfect(scores)]
+        for part in (_listing(findings, self.most), _table(report), _score_table(scores)):
+            print(*part, sep="\n", end="\n" if part else "")
+        serious = sum(finding.serious for finding in findings)
+        print(f"{serious} findings must be mended, {len(findings) - serious} are worth a look.")
+        return 1 if serious else 0
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ def _listing(findings: Sequence[Finding], most: int) -> list[str]:
     return lines
 
 
-def _table(report: Report) -> str:
+def _table(report: Report) -> list[str]:
     """Amounts per frame and objects by type."""
     import numpy as np
 
@@ -163,4 +166,21 @@ def _table(report: Report) -> str:
             f"{name:<15} {row.objects:>8} {row.out_of_range:>13} {row.without_points:>15}"
             f"  {length:>6.2f}  {width:>6.2f}  {height:>6.2f}  {row.center_z:>8.2f}"
         )
-    return "\n".join(rows)
+    return rows
+
+
+def _score_table(scores: Sequence[PerfectScore]) -> list[str]:
+    """What the labels score as detections, and what that says where it is less than 100."""
+    from ciassd_jax.check import FULL_CURVE
+
+    if not scores:
+        return []
+    rows = ["Labels as detections      AP R40: easy  moderate    hard   objects"]
+    for score in scores:
+        precision = "  ".join(f"{value:>8.2f}" for value in score.score)
+        rows.append(f"{score.name:<15} {score.metric:<10} {precision}   {', '.join(map(str, score.objects))}")
+    if any(min(score.objects) < FULL_CURVE for score in scores):
+        rows.append(
+            f"By the official rule fewer than {FULL_CURVE} objects cannot score 100, however well they are found."
+        )
+    return rows

@@ -13,6 +13,7 @@ from ciassd_jax.data.splits import Places, present_files, split_names
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.formats.kitti import read_lines
 from ciassd_jax.formats.points import read_points
+from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.types import Boxes
 
 PLACES: Places = {"cloud": ("points/{}.npy",), "label": ("labels/{}.txt",)}
@@ -38,7 +39,8 @@ def read_custom_frame(name: str, *, root: Path) -> Frame:
     points = unit_intensity(read_points(path), path)
     rows = read_custom_rows(root / PLACES["label"][0].format(name))
     boxes = Boxes.from_array(np.array([row.box for row in rows], np.float64).reshape(-1, 7))
-    return Frame(name, points, boxes, tuple(row.type for row in rows), difficulty_by_points(points, boxes), None)
+    inside = np.asarray(points_in_boxes(points, boxes)).sum(-1)
+    return Frame(name, points, boxes, tuple(row.type for row in rows), difficulty_by_points(inside), None)
 
 
 def read_custom_rows(path: Path) -> list[CustomRow]:

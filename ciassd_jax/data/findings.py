@@ -59,8 +59,3 @@ class Report(NamedTuple):
     findings: tuple[Finding, ...]
     frames: tuple[CheckedFrame, ...]
     types: dict[str, TypeSummary]
-
-    @property
-    def good(self) -> bool:
-        """Whether nothing must be mended."""
-        return not any(finding.serious for finding in self.findings)

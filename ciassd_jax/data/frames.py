@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float32, Int
 
 from ciassd_jax.formats.errors import FormatWarning, Pathlike
 from ciassd_jax.formats.kitti_camera import Camera
-from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.types import Boxes
 
 
@@ -60,9 +59,8 @@ class Dataset:
 _POINTS_OF_DIFFICULTY = (100, 30, 5)
 
 
-def difficulty_by_points(points: Float[np.ndarray, "P C"], boxes: Boxes) -> Int[np.ndarray, " G"]:
-    """Difficulty by the number of points inside a box: 0 from 100, 1 from 30, 2 from 5, else -1."""
-    inside = points_in_boxes(points, boxes).sum(-1)
+def difficulty_by_points(inside: Int[np.ndarray, " G"]) -> Int[np.ndarray, " G"]:
+    """Difficulty by the number of points inside each box: 0 from 100, 1 from 30, 2 from 5, else -1."""
     levels = (inside[:, None] >= np.array(_POINTS_OF_DIFFICULTY)).sum(-1)
     return np.where(levels > 0, len(_POINTS_OF_DIFFICULTY) - levels, -1)
 
