@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from ciassd_jax.cli.data import Data, Submit
+from ciassd_jax.cli.evaluate import Evaluate
 from ciassd_jax.cli.inference import Convert, Demo, Info, Predict
 from ciassd_jax.cli.messages import UsageError
 from ciassd_jax.formats.errors import FormatError
@@ -21,6 +22,7 @@ Command = (
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[tyro.conf.OmitSubcommandPrefixes[Evaluate], tyro.conf.subcommand("eval")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Submit, tyro.conf.subcommand("submit")]
 )
