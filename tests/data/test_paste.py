@@ -109,7 +109,9 @@ def test_a_file_that_is_not_this_database_is_refused(path, tmp_path):
         bad.write_bytes(content[:cut])
         with pytest.raises(FormatError, match=r"bad\.bin is (no ground-truth|damaged).*ciassd data prepare`\.$"):
             open_database(bad, right)
-    for foreign in (b"PK" + content[2:], content + b"x", content[:16] + b"[1]" + (3).to_bytes(8, "little")):
+    foreign_footer = content[:16] + b"[1]" + (3).to_bytes(8, "little")
+    more, less = content[:200] + bytes(16) + content[200:], content[:200] + content[216:]
+    for foreign in (b"PK" + content[2:], content + b"x", foreign_footer, more, less):
         bad.write_bytes(foreign)
         with pytest.raises(FormatError, match="build it again"):
             open_database(bad, right)
