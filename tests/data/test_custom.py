@@ -1,0 +1,62 @@
+"""One's own data in OpenPCDet's custom layout: no camera, no calibration."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mini_folders import OBJECTS, full_cloud, object_boxes, write_custom
+
+from ciassd_jax.data.custom import read_custom_rows
+from ciassd_jax.data.folders import open_dataset
+from ciassd_jax.data.frames import difficulty_by_points
+from ciassd_jax.formats.errors import FormatError, FormatWarning
+
+
+def test_a_frame_is_what_its_files_say(tmp_path: Path) -> None:
+    dataset = open_dataset(write_custom(tmp_path), "train")
+    frame = dataset.read(1)
+    assert (frame.name, frame.names, frame.camera) == ("b", tuple(OBJECTS), None)
+    np.testing.assert_array_equal(frame.points, full_cloud(1))
+    np.testing.assert_array_equal(frame.boxes.to_array(), object_boxes().to_array())
+    assert frame.boxes.center.dtype == np.float64
+    # 60 points in each object, and perhaps a few of those around.
+    assert frame.difficulty.tolist() == [1, 1, 1]
+    assert [path.name for path in dataset.sources(1)] == ["b.npy", "b.txt"]
+
+
+def test_a_frame_without_objects(tmp_path: Path) -> None:
+    (write_custom(tmp_path) / "labels/a.txt").write_text("\n")
+    frame = open_dataset(tmp_path, "train").read(0)
+    assert (frame.names, frame.boxes.center.shape, frame.difficulty.shape) == ((), (0, 3), (0,))
+
+
+def test_intensities_of_0_to_255_are_divided(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    np.save(root / "points/a.npy", full_cloud(0) * [1, 1, 1, 255])
+    with pytest.warns(FormatWarning, match=r"a\.npy has intensities of up to 25\d.*; they were divided by 255"):
+        frame = open_dataset(root, "train").read(0)
+    np.testing.assert_allclose(frame.points, full_cloud(0), atol=1e-5)
+
+
+def test_difficulty_is_by_points() -> None:
+    inside = np.array([0, 4, 5, 29, 30, 99, 100, 5000])
+    assert difficulty_by_points(inside).tolist() == [-1, -1, 2, 2, 1, 1, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 2 3 4 5 6 7", r"line 2: 7 columns; a label has the 8 x y z dx dy dz heading class, so write it again"),
+        ("1 2 3 4 5 6 7 Car 1", "line 2: 9 columns"),
+        ("Car 1 2 3 4 5 6 7", r"line 2: could not convert string to float: 'Car'; write a number there"),
+        ("1 2 3 4 inf 6 7 Car", r"line 2: a value is not finite; write a number there"),
+    ],
+)
+def test_an_unusable_row_gets_one_sentence(tmp_path: Path, line: str, message: str) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text(f"1 2 3 4 5 6 7 Car\n{line}\n")
+    with pytest.raises(FormatError, match=message) as caught:
+        read_custom_rows(path)
+    assert str(caught.value).startswith(f"{path}, ")
+    assert not re.search(r"\. [A-Z]|\n", str(caught.value))
