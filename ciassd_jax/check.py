@@ -65,7 +65,7 @@ def find_imperfect(scores: Sequence[PerfectScore]) -> list[Finding]:
             "score",
             True,
             f"{one.name} {one.metric}: labels as detections score {_listed(one.score)} where {_listed(one.possible)} "
-            "is possible; look for labels that cover each other, and for a wrong calibration.",
+            "is possible; look for labels that cover each other.",
         )
         for one in scores
         if one.score != one.possible

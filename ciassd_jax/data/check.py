@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float32
 
 from ciassd_jax.config import Config, GridConfig
-from ciassd_jax.data.check_labels import check_object, check_types, read_labelled
+from ciassd_jax.data.check_labels import check_object, check_projection, check_types, read_labelled
 from ciassd_jax.data.custom import PLACES as CUSTOM_PLACES
 from ciassd_jax.data.findings import CheckedFrame, Finding, Labelled, Report, TypeSummary
 from ciassd_jax.data.folders import find_root, is_custom
-from ciassd_jax.data.frames import unit_intensity
-from ciassd_jax.data.kitti import IMAGE, crop_without_images, kitti_folder, read_seen_points
+from ciassd_jax.data.frames import clean_points
+from ciassd_jax.data.kitti import IMAGE, crop_to_view, crop_without_images, is_reduced, kitti_folder
 from ciassd_jax.data.splits import ALL, Places, find_file, listed_names, missing_files, repeated_names
 from ciassd_jax.formats.errors import FormatError, FormatWarning, Pathlike
 from ciassd_jax.formats.kitti_camera import Camera, read_camera
@@ -45,9 +45,10 @@ def check_dataset(
     if not is_custom(root):
         folder, places = kitti_folder(root, split or ALL)
     listed, source = listed_names(root, split or ALL, folder, places)
-    names = [name for name in dict.fromkeys(listed) if find_file(folder, places["cloud"], name)]
+    needed = [paths for kind, paths in places.items() if kind != "label"]
+    names = [name for name in dict.fromkeys(listed) if all(find_file(folder, paths, name) for paths in needed)]
     if not names:
-        raise FormatError(f"{source} names no frame whose cloud is there; check the path.")
+        raise FormatError(f"{source} names no frame that is there; check the path.")
     findings = list(_check_names(listed, source, folder, places))
     findings += [] if split else _check_split_files(root)
     if not is_custom(root) and image_size is None and (guess := crop_without_images(folder, names)):
@@ -105,6 +106,8 @@ def _check_frame(
         objects, more = read_labelled(label, camera and camera.calibration)
         findings += more
     findings += [finding for labelled in objects for finding in check_object(labelled)]
+    if camera is not None:
+        findings += check_projection(objects, camera)
     boxes = Boxes.from_array(np.array([labelled.box for labelled in objects]).reshape(-1, 7))
     inside = np.asarray(points_in_boxes(points, boxes)).sum(-1)
     findings += [
@@ -123,15 +126,13 @@ def _read_cloud(
     assert path is not None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", FormatWarning)
-        points = read_seen_points(folder, name, camera) if camera else unit_intensity(read_points(path), path)
-    findings = [Finding("intensity", False, str(one.message)) for one in caught]
-    broken = int((~np.isfinite(points).all(1)).sum())
-    if broken:
-        text = f"{path}: {broken} of {len(points)} points are not finite; remove them."
-        findings.append(Finding("not finite", True, text))
+        points = clean_points(read_points(path), path)
+    findings = [Finding("points", False, str(one.message)) for one in caught]
     if ((points[:, 3] < 0) | (points[:, 3] > 1)).any():
         text = f"{path}: intensities are not all in [0, 1]; scale them so."
         findings.append(Finding("intensity", False, text))
+    if camera is not None and not is_reduced(path):
+        points = crop_to_view(points, camera)
     if not len(points):
         findings.append(Finding("few points", True, f"{path}: no point is left; check the calibration and the cloud."))
     return points, findings
@@ -140,14 +141,20 @@ def _read_cloud(
 def _count_voxels(points: Float32[np.ndarray, "P 4"], grid: GridConfig) -> int:
     """How many voxels of the grid are occupied."""
     shape = np.array(grid.cells)
-    with np.errstate(invalid="ignore"):
-        cells = np.floor((points[:, :3] - np.array(grid.minimum, np.float32)) / np.array(grid.voxel_size, np.float32))
+    cells = np.floor((points[:, :3] - np.array(grid.minimum, np.float32)) / np.array(grid.voxel_size, np.float32))
     inside = ((cells >= 0) & (cells < shape)).all(-1)
     return len(np.unique(np.ravel_multi_index(tuple(cells[inside].astype(np.int64).T), tuple(shape))))
 
 
 def _check_amounts(frames: Sequence[CheckedFrame], config: Config) -> Iterator[Finding]:
-    """Clouds that are far smaller than usual, and frames beyond a capacity of the config."""
+    """Boxes that mostly hold no point, clouds far smaller than usual, and frames beyond a capacity of the config."""
+    inside = [count for frame in frames for count in frame.inside.tolist()]
+    if inside.count(0) > len(inside) / 2:
+        text = (
+            f"{inside.count(0)} of {len(inside)} boxes hold no point; check that labels, calibration and clouds belong "
+            "together, and the axes of the boxes."
+        )
+        yield Finding("no point", True, text)
     usual = float(np.median([frame.points for frame in frames])) if frames else 0
     for frame in frames:
         if 0 < frame.points < _SPARSE * usual:

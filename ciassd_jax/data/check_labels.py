@@ -13,12 +13,15 @@ from ciassd_jax.data.custom import parse_custom_row
 from ciassd_jax.data.findings import Finding, Labelled
 from ciassd_jax.data.kitti import IGNORED, TYPES
 from ciassd_jax.formats.errors import FormatError
-from ciassd_jax.formats.kitti import Calibration, ObjectRow, parse_row, read_lines, rows_to_boxes
+from ciassd_jax.formats.kitti import Calibration, ObjectRow, boxes_to_rows, parse_row, read_lines, rows_to_boxes
+from ciassd_jax.formats.kitti_camera import Camera
 
 # Labels are rounded to two decimals, so half a turn may read 3.15.
 _LARGEST_HEADING = math.pi + 0.01
 # A type is long when its objects are typically so much longer than wide.
 _LONG = 1.5
+# Image boxes are drawn by hand, not projected: in one of 155 real frames they overlap by less than a half.
+_SAME = 0.25
 _FEW = 5
 
 
@@ -77,6 +80,31 @@ def _check_row(place: str, row: ObjectRow) -> Iterator[Finding]:
         )
     if row.score is not None:
         yield Finding("score", False, f"{place}: a label has no score; remove the last column.")
+
+
+def check_projection(objects: Sequence[Labelled], camera: Camera) -> Iterator[Finding]:
+    """A frame whose boxes project elsewhere than its image boxes lie: those of objects that are seen whole."""
+    every = [labelled.row for labelled in objects if labelled.row is not None]
+    rows = [row for row in every if row.truncated == 0 and row.occluded == 0]
+    boxes = rows_to_boxes(rows, camera.calibration)
+    projected, kept = boxes_to_rows(boxes, np.zeros(len(rows)), [row.type for row in rows], *camera)
+    overlaps = [0.0] * (len(rows) - len(kept))
+    overlaps += [
+        _image_overlap(rows[index].bbox, row.bbox) for index, row in zip(kept.tolist(), projected, strict=True)
+    ]
+    if overlaps and np.median(overlaps) < _SAME:
+        text = (
+            f"{objects[0].place} and others: the boxes project elsewhere than their image boxes lie (overlap "
+            f"{np.median(overlaps):.2f}); check that label and calibration belong together."
+        )
+        yield Finding("projection", False, text)
+
+
+def _image_overlap(a: Sequence[float], b: Sequence[float]) -> float:
+    """Intersection over union of two image boxes (x1, y1, x2, y2); 0 where one of them is empty."""
+    shared = math.prod(max(min(a[i + 2], b[i + 2]) - max(a[i], b[i]), 0) for i in (0, 1))
+    areas = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (a, b))
+    return shared / (areas - shared) if shared else 0.0
 
 
 def check_types(objects: Sequence[Labelled], config: Config) -> Iterator[Finding]:

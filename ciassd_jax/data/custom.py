@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ciassd_jax.data.frames import Dataset, Frame, difficulty_by_points, unit_intensity
+from ciassd_jax.data.frames import Dataset, Frame, clean_points, difficulty_by_points
 from ciassd_jax.data.splits import Places, present_files, split_names
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.formats.kitti import read_lines
@@ -36,7 +36,7 @@ def open_custom(root: Path, split: str) -> Dataset:
 def read_custom_frame(name: str, *, root: Path) -> Frame:
     """Read one frame; difficulty is by the number of points in a box. Raises FormatError for a malformed file."""
     path = root / PLACES["cloud"][0].format(name)
-    points = unit_intensity(read_points(path), path)
+    points = clean_points(read_points(path), path)
     rows = read_custom_rows(root / PLACES["label"][0].format(name))
     boxes = Boxes.from_array(np.array([row.box for row in rows], np.float64).reshape(-1, 7))
     inside = np.asarray(points_in_boxes(points, boxes)).sum(-1)

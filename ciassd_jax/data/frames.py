@@ -19,9 +19,9 @@ from ciassd_jax.types import Boxes
 class Frame(NamedTuple):
     """A labelled frame of P points and G objects in the LiDAR frame, as NumPy arrays.
 
-    Where there is a camera, `points` (x, y, z, intensity) are those that it sees. `boxes` are float64, `names` the
-    types of the objects in the order of the label file without DontCare. `difficulty` is 0 (easy), 1, 2 (hard) or
-    -1 (none of them): KITTI's of the label with a camera (SPEC 1.4), without one `difficulty_by_points`.
+    `points` (x, y, z, intensity) are finite and, where there is a camera, those that it sees. `boxes` are float64,
+    `names` the types of the objects in the order of the label file without DontCare. `difficulty` is 0 (easy), 1,
+    2 (hard) or -1 (none of them): KITTI's of the label with a camera (SPEC 1.4), without one `difficulty_by_points`.
     """
 
     name: str
@@ -65,15 +65,16 @@ def difficulty_by_points(inside: Int[np.ndarray, " G"]) -> Int[np.ndarray, " G"]
     return np.where(levels > 0, len(_POINTS_OF_DIFFICULTY) - levels, -1)
 
 
-def unit_intensity(points: Float32[np.ndarray, "P 4"], path: Pathlike) -> Float32[np.ndarray, "P 4"]:
-    """The points of a file with intensity in [0, 1]: divided by 255, with a warning, where it exceeds 2."""
-    intensity = points[:, 3]
-    top = intensity.max(initial=0, where=np.isfinite(intensity))
-    if top <= 2:
-        return points
-    warnings.warn(
-        f"{path} has intensities of up to {top:g}; they were divided by 255, as they should lie in [0, 1].",
-        FormatWarning,
-        stacklevel=3,
-    )
-    return np.concatenate([points[:, :3], points[:, 3:] / np.float32(255)], 1)
+def clean_points(points: Float32[np.ndarray, "N 4"], path: Pathlike) -> Float32[np.ndarray, "P 4"]:
+    """The finite points of a file, with intensity in [0, 1]: divided by 255 where it exceeds 2; warns of both."""
+    finite = np.isfinite(points).all(1)
+    if not finite.all():
+        text = f"{path}: {(~finite).sum()} of {len(points)} points are not finite; they were left out."
+        warnings.warn(text, FormatWarning, stacklevel=3)
+        points = points[finite]
+    top = points[:, 3].max(initial=0)
+    if top > 2:
+        text = f"{path} has intensities of up to {top:g}; they were divided by 255, as they should lie in [0, 1]."
+        warnings.warn(text, FormatWarning, stacklevel=3)
+        points = np.concatenate([points[:, :3], points[:, 3:] / np.float32(255)], 1)
+    return points

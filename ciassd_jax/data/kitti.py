@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from ciassd_jax.data.frames import Dataset, Frame, unit_intensity
+from ciassd_jax.data.frames import Dataset, Frame, clean_points
 from ciassd_jax.data.splits import Places, find_file, present_files, split_names
 from ciassd_jax.formats.errors import FormatError, FormatWarning
 from ciassd_jax.formats.kitti import ObjectRow, read_rows, rows_to_boxes
@@ -76,8 +76,13 @@ def read_seen_points(folder: Path, name: str, camera: Camera) -> Float32[np.ndar
     path = find_file(folder, PLACES["cloud"], name)
     if path is None:
         raise FormatError(f"{folder / FULL.format(name)} does not exist; copy it, or take the frame off the split.")
-    points = unit_intensity(read_points(path), path)
-    return points if path == folder / REDUCED.format(name) else crop_to_view(points, camera)
+    points = clean_points(read_points(path), path)
+    return points if is_reduced(path) else crop_to_view(points, camera)
+
+
+def is_reduced(path: Path) -> bool:
+    """Whether a cloud holds only what the camera sees."""
+    return path.parent.name == Path(REDUCED).parent.name
 
 
 def crop_to_view(points: Float32[np.ndarray, "N 4"], camera: Camera) -> Float32[np.ndarray, "P 4"]:
@@ -97,7 +102,7 @@ def write_reduced(
     for path in track(clouds):
         folder, name = path.parents[1], path.stem
         camera = read_camera(folder / f"calib/{name}.txt", folder / IMAGE.format(name), image_size)
-        points = crop_to_view(read_points(path), camera)
+        points = crop_to_view(clean_points(read_points(path), path), camera)
         with replacing(folder / REDUCED.format(name)) as temporary:
             write_bin(temporary, points)
     return len(clouds)

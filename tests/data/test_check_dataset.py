@@ -105,8 +105,8 @@ LABEL, CALIB = r"label_2/000000\.txt, line", r"calib/000000\.txt"
         (edit_rows(location=(1, 1, 30)), False, rf"{LABEL} 1: no point lies inside this Car; check its box"),
         (
             edit_points(lambda points: points.__setitem__((3, 0), np.nan)),
-            True,
-            r"1 of 180 points are not finite; remove",
+            False,
+            r"1 of 180 points are not finite; they were left out",
         ),
         (edit_points(lambda points: points.__imul__(np.float32([1, 1, 1, 255]))), False, r"were divided by 255"),
         (edit_points(lambda points: points.__isub__(np.float32([0, 0, 0, 0.5]))), False, r"not all in \[0, 1\]; scale"),
@@ -153,6 +153,45 @@ def test_files_that_are_missing_or_truncated(tmp_path: Path) -> None:
     assert [frame.name for frame in report.frames] == ["000001"]
 
 
+def test_labels_of_another_calibration(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    edit("training/calib/000000.txt", "300 0 320", "300 0 500")(root)
+    finding = only(check_dataset(root, config=tiny()))
+    assert not finding.serious
+    assert finding.text.startswith(
+        f"{root}/training/label_2/000000.txt, line 1 and others: the boxes project elsewhere"
+    )
+    assert finding.text.endswith("check that label and calibration belong together.")
+
+
+def test_boxes_that_mostly_hold_no_point(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    for path in (root / "labels").iterdir():
+        path.write_text("".join(f"{box[1]} {box[0]} -1 1 1 1 0 {kind}\n" for kind, box in OBJECTS.items()))
+    serious = [finding for finding in check_dataset(root, config=tiny()).findings if finding.serious]
+    assert [finding.text for finding in serious] == [
+        "6 of 6 boxes hold no point; check that labels, calibration and clouds belong together, and the axes of the "
+        "boxes."
+    ]
+
+
+def test_a_frame_without_calibration_is_missing_once(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    (root / "training/calib/000001.txt").unlink()
+    report = check_dataset(root, config=tiny())
+    assert "1 of 3 frames have no calibration" in only(report).text
+    assert len(report.frames) == 2
+
+
+def test_points_that_are_not_finite_are_found_before_cropping(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    points = full_cloud(0)
+    points[:7, 1] = np.inf
+    write_bin(root / "training/velodyne/000000.bin", points)
+    text = only(check_dataset(root, config=tiny())).text
+    assert text.endswith(f"velodyne/000000.bin: 7 of {len(points)} points are not finite; they were left out.")
+
+
 def test_split_files(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
     write_split(root, "train", "000000", "000001", "000001", "000002")
@@ -171,7 +210,7 @@ def test_split_files(tmp_path: Path) -> None:
 def test_the_official_list_where_frames_are_missing(tmp_path: Path) -> None:
     report = check_dataset(write_kitti(tmp_path), "train", config=tiny())
     assert "The official list of train: 3711 of 3712 frames have no cloud" in report.findings[0].text
-    with pytest.raises(FormatError, match=r"names no frame whose cloud is there; check the path"):
+    with pytest.raises(FormatError, match=r"names no frame that is there; check the path"):
         check_dataset(tmp_path, "test")
 
 

@@ -39,6 +39,16 @@ def test_intensities_of_0_to_255_are_divided(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.points, full_cloud(0), atol=1e-5)
 
 
+def test_points_that_are_not_finite_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    points = full_cloud(0)
+    points[:3, :3] = [[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf]]
+    np.save(root / "points/a.npy", points)
+    with pytest.warns(FormatWarning, match=rf"a\.npy: 3 of {len(points)} points are not finite; they were left out\."):
+        frame = open_dataset(root, "train").read(0)
+    np.testing.assert_array_equal(frame.points, points[3:])
+
+
 def test_difficulty_is_by_points() -> None:
     inside = np.array([0, 4, 5, 29, 30, 99, 100, 5000])
     assert difficulty_by_points(inside).tolist() == [-1, -1, 2, 2, 1, 1, 0, 0]
