@@ -110,13 +110,14 @@ def trace_curve(
     """
     case = _state_case(evaluand, name, geometry, limit, level, within)
     every = np.array([-np.inf])
-    best_scored = _match(case, every, (-case.score[case.second],))
+    best_scored = _match(case, every, -case.score[case.second])
     num_truths = int(case.valid_truths.sum())
     hit_scores = case.score[best_scored.candidates.detection[best_scored.hits[0]]]
     thresholds = pick_thresholds(hit_scores, num_truths)
 
-    neutral = ~case.valid_detections[case.second]
-    match = _match(case, thresholds, (neutral, np.where(neutral, 0, -case.overlap)))
+    # Neutral ones come last, in the order of rows.
+    cost = np.where(case.valid_detections[case.second], -case.overlap, 0)
+    match = _match(case, thresholds, cost)
     true = match.hits.sum(1)
     countable = np.flatnonzero(case.countable)
     false = ((case.score[countable] >= thresholds[:, None]) & ~match.taken[:, countable]).sum(1)
@@ -197,8 +198,8 @@ def _state_case(
     )
 
 
-def _match(case: _Case, thresholds: Float64[np.ndarray, " T"], preference: tuple[np.ndarray, ...]) -> _Match:
-    candidates = order_candidates(case.first, case.second, case.frame, preference)
+def _match(case: _Case, thresholds: Float64[np.ndarray, " T"], cost: Float64[np.ndarray, " E"]) -> _Match:
+    candidates = order_candidates(case.first, case.second, case.frame, cost)
     visible = case.score[candidates.detection] >= thresholds[:, None]
     chosen, taken = assign(candidates, visible, len(case.score))
     found = chosen & case.valid_truths[candidates.truth]

@@ -26,16 +26,16 @@ def order_candidates(
     truth: Int[np.ndarray, " E"],
     detection: Int[np.ndarray, " E"],
     frame: Int[np.ndarray, " E"],
-    preference: tuple[np.ndarray, ...],
+    cost: Float64[np.ndarray, " E"],
 ) -> Candidates:
-    """Sort pairs for `assign`: by round, object, the `preference` keys (first key first, smaller is better), row.
+    """Sort pairs for `assign`: by round, object and ascending `cost`; pairs of equal cost keep their order.
 
-    `frame` is that of each pair; `truth` and `detection` ascend with it.
+    `frame` is that of each pair and does not descend, nor does `truth`.
     """
     objects, first, owner = np.unique(truth, return_index=True, return_inverse=True)
     frames = frame[first]
     place = np.arange(len(objects)) - np.searchsorted(frames, frames)
-    order = np.lexsort((detection, *reversed(preference), truth, place[owner]))
+    order = np.lexsort((cost, truth, place[owner]))
     sorted_truth = truth[order]
     start = np.flatnonzero(np.diff(sorted_truth, prepend=-1))
     rounds = np.searchsorted(np.sort(place), np.arange(place.max(initial=-1) + 2))

@@ -48,13 +48,12 @@ def intersect(a: FlatObjects, b: FlatObjects) -> dict[Geometry, Intersections]:
     footprint = intersection_bev(_footprints(a.boxes, first), _footprints(b.boxes, second))
     height = np.minimum(_top(a.boxes)[first], _top(b.boxes)[second])
     height -= np.maximum(_bottom(a.boxes)[first], _bottom(b.boxes)[second])
-    volume = footprint * np.where(height > 0, height, 0)
     area, other_area = np.abs(a.boxes.size[:, :2]).prod(1), np.abs(b.boxes.size[:, :2]).prod(1)
     size, other_size = area * a.boxes.size[:, 2], other_area * b.boxes.size[:, 2]
     return {
         "bbox": image,
         "bev": _shared_only(first, second, np.asarray(footprint), area[first], other_area[second]),
-        "3d": _shared_only(first, second, np.asarray(volume), size[first], other_size[second]),
+        "3d": _shared_only(first, second, np.asarray(footprint * height), size[first], other_size[second]),
     }
 
 

@@ -71,6 +71,15 @@ def test_a_low_detection_is_neutral_whatever_its_class() -> None:
     assert counts(curve_of([truth, hit], [low, found(hit, 0.8)], level=1)) == [(1, 0, 1)]
 
 
+def test_the_first_row_of_neutral_detections_is_taken() -> None:
+    first, second = label(bbox=(0, 0, 100, 45)), label(bbox=(14, 0, 114, 45))
+    # Both are too low; only the first object overlaps the second one enough.
+    low = [found(first, 0.9, bbox=(7, 0, 107, 39)), found(first, 0.9, bbox=(0, 0, 100, 39))]
+    hit = label(5)
+    assert counts(curve_of([first, second, hit], [*low, found(hit, 0.5)])) == [(1, 0, 1)]
+    assert counts(curve_of([first, second, hit], [*low[::-1], found(hit, 0.5)])) == [(1, 0, 0)]
+
+
 def test_neighbours_and_hard_objects_take_one_detection_each() -> None:
     for neutral in (label(name="Van"), label(occluded=3)):
         other = label(5)
@@ -138,6 +147,14 @@ def test_what_is_not_evaluated() -> None:
     evaluation = evaluate(*records([([car], [found(car, 1.0, bbox=(-1.0, 100, 80, 160))])]))
     assert evaluation.precision("Car", "bbox", 0.7) is evaluation.precision("Car", "aos", 0.7) is None
     assert evaluation.precision("Car", "bev", 0.7) is not None
+    for changes, bev, space in (
+        ({"location": (-1000, -1000, -1000)}, None, None),
+        ({"location": (0, -1000, 20)}, [0, 0, 0], None),
+        ({"dimensions": (-1, 1.6, 4)}, [0, 0, 0], None),
+        ({"dimensions": (1.5, -1.6, 4)}, None, None),
+    ):
+        evaluation = evaluate(*records([([car], [found(car, 1.0, **changes)])]))
+        assert (evaluation.precision("Car", "bev", 0.7), evaluation.precision("Car", "3d", 0.7)) == (bev, space)
     flat = found(car, 1.0, dimensions=(-1, -1, -1), location=(-1000, -1000, -1000), rotation_y=-10)
     evaluation = evaluate(*records([([car], [flat])]))
     assert evaluation.precision("Car", "bev", 0.7) is evaluation.precision("Car", "3d", 0.7) is None

@@ -68,6 +68,8 @@ def test_what_is_not_given_shares_nothing() -> None:
     flat = found(row, 1.0, dimensions=(-1, -1, -1), location=(-1000, -1000, -1000), rotation_y=-10)
     assert len(one_pair(row, flat, "bev").first) == len(one_pair(row, flat, "3d").first) == 0
     assert len(one_pair(row, flat, "bbox").first) == 1
+    thin = found(row, 1.0, dimensions=(1.5, -1.6, 4.0))
+    np.testing.assert_allclose(one_pair(row, thin, "bev").overlap, 1, atol=1e-12)
     # A negative size is a size in the plane only, as in the official program.
     huge = label(name="DontCare", dimensions=(-1000, -1000, -1000), location=(-10, -1, -1), rotation_y=-1)
     np.testing.assert_allclose(one_pair(huge, found(row, 1.0), "bev").coverage, 1)
