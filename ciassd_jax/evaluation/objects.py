@@ -104,8 +104,7 @@ def _geometry(
     location = np.array([row.location for row in rows], np.float64).reshape(-1, 3)
     size = np.array([row.dimensions[::-1] for row in rows], np.float64).reshape(-1, 3)
     rotation_y = np.array([row.rotation_y for row in rows], np.float64)
-    # Depth has no say in what is given.
-    location[:, :2][location[:, :2] == _NO_LOCATION] = np.nan
+    location[location == _NO_LOCATION] = np.nan
     center = np.stack([location[:, 0], location[:, 2], size[:, 2] / 2 - location[:, 1]], -1)
     image_boxes = np.array([row.bbox for row in rows], np.float64).reshape(-1, 4)
     alpha = np.array([row.alpha for row in rows], np.float64)

@@ -15,6 +15,11 @@ def one_pair(first: ObjectRow, second: ObjectRow, geometry: str) -> Intersection
     return intersect(labels, detections)[geometry]
 
 
+def overlap_of(first: ObjectRow, second: ObjectRow, geometry: str) -> float:
+    """Their overlap, which is not nothing."""
+    return one_pair(first, second, geometry).overlap.item()
+
+
 @pytest.mark.parametrize("geometry", ["bbox", "bev", "3d"])
 def test_agrees_with_a_polygon_clipper(geometry: str) -> None:
     frames = random_frames(np.random.default_rng(0), 60)
@@ -41,8 +46,8 @@ def test_agrees_with_a_polygon_clipper(geometry: str) -> None:
 @pytest.mark.parametrize("geometry", ["bbox", "bev", "3d"])
 def test_identical_objects_overlap_entirely(geometry: str) -> None:
     row = label(3, rotation_y=2.2)
-    pair = one_pair(row, found(row, 1.0), geometry)
-    np.testing.assert_allclose([pair.overlap, pair.coverage], 1, atol=1e-13)
+    assert overlap_of(row, found(row, 1.0), geometry) == pytest.approx(1, abs=1e-13)
+    assert one_pair(row, found(row, 1.0), geometry).coverage.item() == pytest.approx(1, abs=1e-13)
 
 
 def test_turned_by_half_a_turn_or_with_its_sides_exchanged() -> None:
@@ -52,15 +57,15 @@ def test_turned_by_half_a_turn_or_with_its_sides_exchanged() -> None:
         {"rotation_y": row.rotation_y + np.pi},
         {"rotation_y": row.rotation_y - np.pi / 2, "dimensions": (1.5, length, width)},
     ):
-        np.testing.assert_allclose(one_pair(row, found(row, 1.0, **changes), "3d").overlap, 1, atol=1e-12)
+        assert overlap_of(row, found(row, 1.0, **changes), "3d") == pytest.approx(1, abs=1e-12)
 
 
 def test_one_above_the_other() -> None:
     row = label()
     half = found(row, 1.0, location=(0.0, 1.7 - 0.75, 20.0))
-    np.testing.assert_allclose(one_pair(row, half, "3d").overlap, 1 / 3, atol=1e-12)
+    assert overlap_of(row, half, "3d") == pytest.approx(1 / 3, abs=1e-12)
     assert len(one_pair(row, found(row, 1.0, location=(0.0, 0.2, 20.0)), "3d").first) == 0
-    np.testing.assert_allclose(one_pair(row, half, "bev").overlap, 1, atol=1e-12)
+    assert overlap_of(row, half, "bev") == pytest.approx(1, abs=1e-12)
 
 
 def test_what_is_not_given_shares_nothing() -> None:
@@ -68,9 +73,10 @@ def test_what_is_not_given_shares_nothing() -> None:
     flat = found(row, 1.0, dimensions=(-1, -1, -1), location=(-1000, -1000, -1000), rotation_y=-10)
     assert len(one_pair(row, flat, "bev").first) == len(one_pair(row, flat, "3d").first) == 0
     assert len(one_pair(row, flat, "bbox").first) == 1
-    thin = found(row, 1.0, dimensions=(1.5, -1.6, 4.0))
-    np.testing.assert_allclose(one_pair(row, thin, "bev").overlap, 1, atol=1e-12)
+    thin = label(dimensions=(1.5, -1.6, 4.0))
+    assert overlap_of(thin, found(row, 1.0), "bev") == pytest.approx(1, abs=1e-12)
+    assert overlap_of(row, found(thin, 1.0), "bev") == pytest.approx(1, abs=1e-12)
     # A negative size is a size in the plane only, as in the official program.
     huge = label(name="DontCare", dimensions=(-1000, -1000, -1000), location=(-10, -1, -1), rotation_y=-1)
-    np.testing.assert_allclose(one_pair(huge, found(row, 1.0), "bev").coverage, 1)
+    assert one_pair(huge, found(row, 1.0), "bev").coverage.item() == pytest.approx(1)
     assert len(one_pair(huge, found(row, 1.0), "3d").first) == 0

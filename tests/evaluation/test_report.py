@@ -96,6 +96,12 @@ def test_enough_objects_need_no_word() -> None:
     assert "fewer than 41" not in format_tables(evaluate(*records(frames)))
 
 
+def test_a_part_without_objects_has_no_ap() -> None:
+    text = format_tables(evaluate(*records([([label()], [found(label(), 1.0)])])))
+    assert re.search(r"^Car +3d +20-40 m +0\.00 +0\.00 +0\.00 +1 +1 +1$", text, re.MULTILINE)
+    assert re.search(r"^Car +3d +40\+ m +- +- +- +0 +0 +0$", text, re.MULTILINE)
+
+
 def test_without_a_camera_the_report_says_so() -> None:
     truths, detections = records([([label()], [found(label(), 1.0)])])
     truths = [frame._replace(image_boxes=None, alpha=None, points=np.array([70])) for frame in truths]
