@@ -34,7 +34,8 @@ class Curve(NamedTuple):
     `true`, `false` and `missed` count hits, false positives and objects without a detection; an object whose
     detection is neutral is none of them, yet one of `num_truths`. `similarity` is the sum of the orientation
     scores (1 + cos(difference of alpha)) / 2 of the hits. `precision` and `orientation` are the 41 points after the
-    running maximum, 0 past the last threshold. Where a threshold finds neither hit nor false positive they are NaN.
+    running maximum, 0 past the last threshold. Where a threshold finds neither hit nor false positive they are NaN;
+    without a camera so is all that is about orientation.
     """
 
     num_truths: int

@@ -84,7 +84,7 @@ def _main_table(evaluation: Evaluation) -> str:
             for metric in METRICS
             if evaluation.curves.get((name, metric, limit)) is not None
         ]
-        lines += rows or [f"{name:<12}not evaluated, as there are no detections of it"]
+        lines += rows or [f"{name:<12}not evaluated, as no detection of it has what a metric needs"]
     return "\n".join(lines)
 
 
