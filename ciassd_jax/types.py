@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt32
 
 Array = jax.Array | np.ndarray
 # Flax variables: {"params": ..., "batch_stats": ...}, or a train state that has both.
@@ -111,10 +111,15 @@ class SparseVoxels(NamedTuple):
 
 
 class Sites(NamedTuple):
-    """Active sites of one grid by ascending linear key; padding has the largest int32 and comes last."""
+    """Active sites of one grid by ascending linear key; padding has the largest int32 and comes last.
+
+    `columns` finds them (`ops/sites.py`): for every BEV column (y, x) a bit for each active z in words of 32, then the
+    slot of the lowest. The dense backend has none.
+    """
 
     keys: Int[Array, "*b V"]
     count: Int[Array, "*b"]  # type: ignore[assignment]
+    columns: UInt32[Array, "*b columns words"] | None = None
 
 
 class NeighbourTable(NamedTuple):

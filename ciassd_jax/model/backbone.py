@@ -12,8 +12,9 @@ from jaxtyping import Array, Float, Int
 
 from ciassd_jax.config import BackboneConfig
 from ciassd_jax.model.layers import Convolution, SparseConvNormRelu
+from ciassd_jax.ops import sites as site_ops
 from ciassd_jax.ops import sparse, sparse_dense
-from ciassd_jax.ops.sparse import Triple
+from ciassd_jax.ops.sites import NO_SITE, Triple
 from ciassd_jax.types import Sites, SparseVoxels
 
 
@@ -32,7 +33,7 @@ class SPConvNet(nn.Module):
         """The BEV map (z layers folded into the channels), and sites kept and dropped at each strided stage."""
         layer = partial(SparseConvNormRelu, dtype=self.dtype, axis_name=self.axis_name)
         shapes = self.config.stage_shapes(self.shape)
-        sites = _sites_of(voxels, self.shape)
+        sites = _sites_of(voxels, self.shape, self.config.backend)
         x = jnp.asarray(voxels.features).reshape(-1, voxels.features.shape[-1])
         kept, dropped = [], []
         for i, stage in enumerate(self.config.stages):
@@ -62,7 +63,7 @@ class _Strided:
     def plan(self, sites: Sites, capacity: int, backend: str) -> tuple[Sites, Convolution, Int[Array, " B"]]:
         """Sites after the convolution, the convolution itself, and how many sites were over capacity."""
         geometry, kernel = self.geometry, self.kernel
-        find = (sparse if backend == "gather" else sparse_dense).strided_sites
+        find = (site_ops if backend == "gather" else sparse_dense).strided_sites
         out_sites, dropped = jax.vmap(partial(find, kernel=kernel, capacity=capacity, **geometry))(sites)
         if backend == "gather":
             table = jax.vmap(lambda a, b: sparse.strided_table(a, b, kernel=kernel, **geometry))(sites, out_sites)
@@ -96,17 +97,22 @@ def _dense(sites: Sites, out_sites: Sites, **geometry: Any) -> Convolution:
     return convolution
 
 
-def _sites_of(voxels: SparseVoxels, shape: Triple) -> Sites:
+def _sites_of(voxels: SparseVoxels, shape: Triple, backend: str) -> Sites:
     real = jnp.arange(voxels.coordinates.shape[1], dtype=jnp.int32)[None] < voxels.count[:, None]
-    return Sites(jnp.where(real, sparse.linear_keys(voxels.coordinates, shape), sparse.NO_SITE), voxels.count)
+    keys = jnp.where(real, site_ops.linear_keys(voxels.coordinates, shape), NO_SITE)
+    return (
+        jax.vmap(partial(site_ops.active_sites, shape=shape))(keys)
+        if backend == "gather"
+        else Sites(keys, voxels.count)
+    )
 
 
 def _real(sites: Sites) -> Array:
-    return (sites.keys != sparse.NO_SITE).reshape(-1)
+    return (sites.keys != NO_SITE).reshape(-1)
 
 
 def _fold_height(features: Float[Array, "B V C"], sites: Sites, shape: Triple) -> Float[Array, "B H W C2"]:
     """Dense BEV map with channel c * Z + z, as a (C, Z, H, W) tensor folds in the released code."""
-    grid = jnp.asarray(jax.vmap(partial(sparse.to_dense, shape=shape))(features, sites))
+    grid = jnp.asarray(jax.vmap(partial(site_ops.to_dense, shape=shape))(features, sites))
     depth, height, width = shape
     return grid.transpose(0, 2, 3, 4, 1).reshape(-1, height, width, features.shape[-1] * depth)

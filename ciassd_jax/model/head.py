@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from ciassd_jax.config import HeadConfig
-from ciassd_jax.model.layers import uniform_by_fan_in
+from ciassd_jax.model.layers import convolve_2d, uniform_by_fan_in
 from ciassd_jax.types import Predictions
 
 
@@ -25,15 +24,9 @@ class Branch(nn.Module):
         size, inputs = self.kernel_size, x.shape[-1]
         init = uniform_by_fan_in(size * size * inputs)
         kernel = self.param("kernel", init, (size, size, inputs, self.channels), jnp.float32)
-        padding = size // 2
-        x = lax.conv_general_dilated(
-            x.astype(self.dtype),
-            kernel.astype(self.dtype),
-            (1, 1),
-            [(padding, padding)] * 2,
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision=lax.Precision.HIGHEST,
-        ).astype(jnp.promote_types(self.dtype, jnp.float32))
+        around = (size // 2, size // 2)
+        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), padding=(around, around))
+        x = x.astype(jnp.promote_types(self.dtype, jnp.float32))
         if self.use_bias:
             x = x + self.param("bias", init, (self.channels,), jnp.float32).reshape(1, 1, 1, -1)
         return x

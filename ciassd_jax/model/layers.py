@@ -105,6 +105,27 @@ class SparseConvNormRelu(nn.Module):
         return jnp.where(mask[:, None], nn.relu(x), 0)
 
 
+def convolve_2d(
+    x: Float[Array, "B H W C"],
+    kernel: Float[Array, "Y X C O"],
+    *,
+    padding: tuple[tuple[int, int], tuple[int, int]],
+    stride: int = 1,
+) -> Float[Array, "B H2 W2 O"]:
+    """Cross-correlation with zeros around, in full float32 precision on every device."""
+    if kernel.shape[:2] == (1, 1) and stride == 1:
+        # The same sums as a matrix product: on a CPU in less than half of the time.
+        return jnp.matmul(x, kernel[0, 0], precision=lax.Precision.HIGHEST)
+    return lax.conv_general_dilated(
+        x,
+        kernel,
+        (stride, stride),
+        padding,
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=lax.Precision.HIGHEST,
+    )
+
+
 class ConvNormRelu(nn.Module):
     """A 2D convolution without bias on [B, H, W, C], BatchNorm, and ReLU where asked."""
 
@@ -120,15 +141,8 @@ class ConvNormRelu(nn.Module):
         size, inputs = self.kernel_size, x.shape[-1]
         shape = (size, size, inputs, self.channels)
         kernel = self.param("kernel", uniform_by_fan_in(size * size * inputs), shape, jnp.float32)
-        padding = size // 2
-        x = lax.conv_general_dilated(
-            x.astype(self.dtype),
-            kernel.astype(self.dtype),
-            (self.stride, self.stride),
-            [(padding, padding)] * 2,
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision=lax.Precision.HIGHEST,
-        )
+        around = (size // 2, size // 2)
+        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), stride=self.stride, padding=(around, around))
         x = MaskedBatchNorm(self.axis_name, name="norm")(x, train=train)
         return nn.relu(x) if self.relu else x
 
@@ -162,14 +176,7 @@ def upsample(x: Float[Array, "B H W C"], kernel: Float[Array, "3 3 C O"]) -> Flo
 
     def phase(odd_y: int, odd_x: int) -> Array:
         part = kernel[jnp.array(taps[odd_y])][:, jnp.array(taps[odd_x])]
-        return lax.conv_general_dilated(
-            x,
-            part,
-            (1, 1),
-            [(0, odd_y), (0, odd_x)],
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision=lax.Precision.HIGHEST,
-        )
+        return convolve_2d(x, part, padding=((0, odd_y), (0, odd_x)))
 
     rows = [jnp.stack([phase(y, 0), phase(y, 1)], 3) for y in (0, 1)]
     batch, height, width, _ = x.shape

@@ -23,11 +23,12 @@ def intersection_bev(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
     where the rectangles lie on the same side, not at all where they only touch.
     """
     xp = np if isinstance(a.yaw, np.ndarray) and isinstance(b.yaw, np.ndarray) else jnp
-    cosine, sine = xp.cos(a.yaw), xp.sin(a.yaw)
+    cosine_a, sine_a, cosine_b, sine_b = xp.cos(a.yaw), xp.sin(a.yaw), xp.cos(b.yaw), xp.sin(b.yaw)
     dx, dy = b.center[..., 0] - a.center[..., 0], b.center[..., 1] - a.center[..., 1]
-    x, y = cosine * dx + sine * dy, cosine * dy - sine * dx
+    x, y = cosine_a * dx + sine_a * dy, cosine_a * dy - sine_a * dx
     p, q = a.size[..., 0] / 2, a.size[..., 1] / 2
-    cosine, sine = xp.cos(b.yaw - a.yaw), xp.sin(b.yaw - a.yaw)
+    # Of the turn from a to b; products, as sines of every pair would take most of the time.
+    cosine, sine = cosine_a * cosine_b + sine_a * sine_b, cosine_a * sine_b - sine_a * cosine_b
     u, v = b.size[..., 0] / 2, b.size[..., 1] / 2
     ux, uy, vx, vy = u * cosine, u * sine, -v * sine, v * cosine
     starts = [

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from ciassd_jax.ops.iou import iou_bev
 from ciassd_jax.types import Array, Boxes, Candidates
 
-_TILE = 128
+_BLOCK_ROWS = 64
 
 
 class Clusters(NamedTuple):
@@ -27,25 +27,25 @@ class Clusters(NamedTuple):
     selected: Bool[Array, " K"]
 
 
+@jax.custom_batching.sequential_vmap
 def pairwise_iou(boxes: Boxes, count: Int[Array, ""]) -> Float[Array, "K K"]:
     """Rotated BEV IoU of the first `count` boxes with each other, zero elsewhere.
 
-    Computed in tiles, so that padding costs nothing.
+    Computed in blocks of rows, so that padding costs nothing; scene after scene, each with as many as it needs.
     """
     capacity = boxes.yaw.shape[0]
-    tile = min(_TILE, capacity)
-    tiles = -(-capacity // tile)
-    padded = jax.tree.map(lambda leaf: _pad_rows(leaf, tiles * tile), boxes)
-    used = -(-count // tile)
+    rows = min(_BLOCK_ROWS, capacity)
+    blocks = -(-capacity // rows)
+    padded = jax.tree.map(lambda leaf: _pad_rows(leaf, blocks * rows), boxes)
+    columns = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], boxes)
 
-    def fill(index: Array, result: Array) -> Array:
-        row, column = index // used * tile, index % used * tile
-        one = jax.tree.map(lambda leaf: lax.dynamic_slice_in_dim(leaf, row, tile)[:, None], padded)
-        other = jax.tree.map(lambda leaf: lax.dynamic_slice_in_dim(leaf, column, tile)[None], padded)
-        return lax.dynamic_update_slice(result, iou_bev(one, other), (row, column))
+    def fill(block: Array, result: Array) -> Array:
+        start = block * rows
+        some = jax.tree.map(lambda leaf: lax.dynamic_slice_in_dim(leaf, start, rows)[:, None], padded)
+        return lax.dynamic_update_slice_in_dim(result, iou_bev(some, columns), start, 0)
 
-    empty = jnp.zeros((tiles * tile, tiles * tile), boxes.yaw.dtype)
-    overlap = lax.fori_loop(jnp.int32(0), (used * used).astype(jnp.int32), fill, empty)[:capacity, :capacity]
+    empty = jnp.zeros((blocks * rows, capacity), boxes.yaw.dtype)
+    overlap = lax.fori_loop(jnp.int32(0), (-(-count // rows)).astype(jnp.int32), fill, empty)[:capacity]
     real = jnp.arange(capacity, dtype=jnp.int32) < count
     return jnp.where(real[:, None] & real[None], overlap, 0)
 
@@ -179,10 +179,8 @@ def _average(boxes: Boxes, weights: Float[Array, "K K"], *, align: bool) -> Boxe
     own = boxes.to_array()
     # A box of an infinite size overlaps nothing, but its zero weight times infinity would be no number.
     finite = jnp.where(jnp.isfinite(own), own, 0)
-    # Differences from the row's own box are small: the mean loses no digits.
-    offset = finite[None] - finite[:, None]
+    mean = jnp.matmul(share, finite, precision=lax.Precision.HIGHEST)
     if align:
-        turn = offset[..., 6]
-        offset = jnp.asarray(offset).at[..., 6].set(turn - jnp.round(turn / jnp.pi) * jnp.pi)
-    mean = own + jnp.where(usable[:, None], (share[..., None] * offset).sum(1), 0)
-    return Boxes.from_array(mean)
+        half_turns = jnp.round((finite[None, :, 6] - finite[:, None, 6]) / jnp.pi)
+        mean = mean.at[:, 6].add(-jnp.pi * (share * half_turns).sum(1))
+    return Boxes.from_array(jnp.where(usable[:, None], mean, own))

@@ -1,94 +1,31 @@
 """Sparse 3D convolution with static shapes (paper section 3.1, SPEC section 4).
 
-A scene is a grid (z, y, x) in which only active sites exist. Sites are sorted by linear key with z fastest, so
-that the sites of a BEV column are adjacent; a map of the columns finds any of them in constant time. A neighbour
-table says which input each kernel offset reads; a convolution is a gather through it and one matrix product for
-each block of rows, in value and in gradient. `sparse_dense.py` holds the definition that this must equal.
+A scene is a grid (z, y, x) in which only active sites exist (`sites.py`). A neighbour table says which input each
+kernel offset reads; a convolution is a gather through it and one matrix product for each block of rows, in value and
+in gradient. `sparse_dense.py` holds the definition that this must equal.
 """
 
 from __future__ import annotations
 
 import functools
-import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Bool, Float, Int, UInt32
+from jaxtyping import Float, Int
 
+from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of, slots_at
 from ciassd_jax.types import Array, NeighbourTable, Sites
-
-Triple = tuple[int, int, int]
-NO_SITE = np.int32(np.iinfo(np.int32).max)
 
 # Rows of the output computed at once. On a CPU the gathered block must stay in cache; elsewhere large
 # products matter more.
-_BLOCK_ROWS = {"cpu": 1000, "default": 32000}
-
-
-def linear_keys(coordinates: Int[Array, "*n 3"], shape: Triple) -> Int[Array, "*n"]:
-    """Linear key of (z, y, x) with z fastest, then x, then y."""
-    depth, _, width = shape
-    z, y, x = coordinates[..., 0], coordinates[..., 1], coordinates[..., 2]
-    return (y * width + x) * depth + z
-
-
-def coordinates_of(keys: Int[Array, "*n"], shape: Triple) -> Int[Array, "*n 3"]:
-    """Inverse of `linear_keys`: (z, y, x)."""
-    depth, _, width = shape
-    column = keys // depth
-    return jnp.stack([keys % depth, column // width, column % width], -1)
-
-
-def sort_unique(keys: Int[Array, " N"], *, capacity: int) -> tuple[Sites, Int[Array, ""]]:
-    """Sites of the lowest distinct keys (`NO_SITE` marks none), and how many over capacity were dropped."""
-    keys = jnp.sort(keys)
-    previous = jnp.concatenate([jnp.full(1, -1, keys.dtype), keys[:-1]])
-    is_first = (keys != previous) & (keys != NO_SITE)
-    rank = jnp.cumsum(is_first, dtype=jnp.int32)
-    found = rank[-1]
-    slots = jnp.arange(capacity, dtype=jnp.int32)
-    # The v-th distinct key stands where the running count first reaches v + 1.
-    position = jnp.minimum(jnp.searchsorted(rank, slots + 1).astype(jnp.int32), keys.shape[0] - 1)
-    count = jnp.minimum(found, capacity)
-    return Sites(jnp.where(slots < count, keys[position], NO_SITE), count), found - count
-
-
-def strided_sites(
-    sites: Sites,
-    *,
-    shape: Triple,
-    out_shape: Triple,
-    kernel: Triple,
-    stride: Triple,
-    padding: Triple,
-    capacity: int,
-) -> tuple[Sites, Int[Array, ""]]:
-    """Sites of a strided convolution: every output whose window holds an active input.
-
-    `shape` and `out_shape` are the grids (z, y, x) before and after. Over capacity the sites of lowest key
-    stay; the second result counts the others.
-    """
-    coordinates = coordinates_of(sites.keys, shape)
-    candidates = []
-    # An input at i is read by outputs o with 0 <= i + padding - o * stride < kernel.
-    reach = [range(-(-k // s)) for k, s in zip(kernel, stride, strict=True)]
-    for back in itertools.product(*reach):
-        output, inside = [], sites.keys != NO_SITE
-        for axis in range(3):
-            shifted = coordinates[:, axis] + padding[axis]
-            o = shifted // stride[axis] - back[axis]
-            inside &= (shifted - o * stride[axis] < kernel[axis]) & (o >= 0) & (o < out_shape[axis])
-            output.append(o)
-        candidates.append(jnp.where(inside, linear_keys(jnp.stack(output, -1), out_shape), NO_SITE))
-    return sort_unique(jnp.concatenate(candidates), capacity=capacity)
+_BLOCK_ROWS = {"cpu": 2000, "default": 32000}
 
 
 def submanifold_table(sites: Sites, *, shape: Triple) -> NeighbourTable:
     """Neighbours of a 3 x 3 x 3 submanifold convolution, offsets in C order (z, y, x)."""
-    corner = coordinates_of(sites.keys, shape) - 1
-    inputs = _window_indices(sites, corner, sites.keys != NO_SITE, shape=shape, kernel=(3, 3, 3))
+    inputs = _inputs(sites, sites, shape=shape, out_shape=shape, kernel=(3, 3, 3), stride=(1, 1, 1), padding=(1, 1, 1))
     # Who reads me through offset k is whom I read through the mirrored offset.
     return NeighbourTable(inputs, inputs[:, ::-1])
 
@@ -104,74 +41,32 @@ def strided_table(
     padding: Triple,
 ) -> NeighbourTable:
     """Neighbours of a strided convolution from `sites` to `out_sites`, offsets in C order (z, y, x)."""
-    strides, paddings = jnp.array(stride, jnp.int32), jnp.array(padding, jnp.int32)
-    corner = coordinates_of(out_sites.keys, out_shape) * strides[None] - paddings[None]
-    inputs = _window_indices(sites, corner, out_sites.keys != NO_SITE, shape=shape, kernel=kernel)
-    offsets = jnp.array(list(np.ndindex(*kernel)), jnp.int32)
-    shifted = (coordinates_of(sites.keys, shape) + paddings[None])[:, None] - offsets[None]
-    output = shifted // strides[None, None]
-    inside = (sites.keys != NO_SITE)[:, None] & (shifted % strides[None, None] == 0).all(-1)
-    inside &= ((output >= 0) & (output < jnp.array(out_shape, jnp.int32)[None, None])).all(-1)
-    return NeighbourTable(inputs, _site_indices(out_sites, linear_keys(output, out_shape), inside))
+    geometry = {"shape": shape, "out_shape": out_shape, "kernel": kernel, "stride": stride, "padding": padding}
+    return NeighbourTable(_inputs(sites, out_sites, **geometry), _outputs(sites, out_sites, **geometry))
 
 
-def _site_indices(sites: Sites, keys: Int[Array, "*n"], wanted: Bool[Array, "*n"]) -> Int[Array, "*n"]:
-    """Slot of each wanted key, the number of slots where it is not active."""
-    slots = sites.keys.shape[0]
-    position = jnp.minimum(jnp.searchsorted(sites.keys, keys).astype(jnp.int32), slots - 1)
-    return jnp.where(wanted & (sites.keys[position] == keys), position, slots)
-
-
-def _column_map(sites: Sites, *, shape: Triple) -> UInt32[Array, "columns words"]:
-    """For every BEV column (y, x): a bit for each active z, in words of 32, and the slot of its lowest site.
-
-    With it a site is found in constant time: its slot is the column's first plus the number of set bits below.
-    """
-    depth, height, width = shape
-    words = -(-depth // 32)
-    slots = sites.keys.shape[0]
-    column, z = sites.keys // depth, sites.keys % depth
-    word = jnp.arange(words, dtype=jnp.int32)[None]
-    bits = jnp.where((z // 32)[:, None] == word, jnp.uint32(1) << (z % 32).astype(jnp.uint32)[:, None], jnp.uint32(0))
-    # Gather the bits of a column in its first site: its sites are adjacent, at most `depth` of them.
-    for step in (2**i for i in range((depth - 1).bit_length())):
-        same = jnp.pad(column[step:], (0, min(step, slots)), constant_values=-1)[:slots] == column
-        later = jnp.pad(bits[step:], ((0, min(step, slots)), (0, 0)))[:slots]
-        bits = bits | jnp.where(same[:, None], later, jnp.uint32(0))
-    slot = jnp.arange(slots, dtype=jnp.int32)
-    is_first = (column != jnp.concatenate([jnp.full(1, -1, jnp.int32), column[:-1]])) & (sites.keys != NO_SITE)
-    place = jnp.where(is_first, column, height * width + slot)
-    entry = jnp.concatenate([bits, slot.astype(jnp.uint32)[:, None]], 1)
-    empty = jnp.zeros((height * width, words + 1), jnp.uint32)
-    return empty.at[place].set(entry, mode="drop", unique_indices=True)
-
-
-def _window_indices(
-    sites: Sites, corner: Int[Array, "V 3"], real: Bool[Array, " V"], *, shape: Triple, kernel: Triple
+def _inputs(
+    sites: Sites, out_sites: Sites, *, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple
 ) -> Int[Array, "V K"]:
-    """Slots of the sites in the windows that start at `corner` (z, y, x), in C order of the kernel."""
-    depth, height, width = shape
-    slots = sites.keys.shape[0]
-    offset_y, offset_x = (jnp.array(o, jnp.int32) for o in zip(*np.ndindex(*kernel[1:]), strict=True))
-    y, x = corner[:, 1:2] + offset_y[None], corner[:, 2:] + offset_x[None]
-    inside = real[:, None] & (y >= 0) & (y < height) & (x >= 0) & (x < width)
-    columns = _column_map(sites, shape=shape)
-    entry = jnp.asarray(columns).at[jnp.where(inside, y * width + x, 0)].get(mode="promise_in_bounds")
-    words, start = entry[..., :-1], entry[..., -1].astype(jnp.int32)
-    found = []
-    for dz in range(kernel[0]):
-        z = corner[:, :1] + dz
-        at = jnp.where((z >= 0) & (z < depth), z, 0)
-        below, active = jnp.zeros(start.shape, jnp.int32), jnp.zeros(start.shape, bool)
-        for i in range(words.shape[-1]):
-            bit = (at - 32 * i).clip(0, 31).astype(jnp.uint32)
-            lower = jnp.where(at < 32 * (i + 1), (jnp.uint32(1) << bit) - 1, jnp.uint32(0xFFFFFFFF))
-            lower = jnp.where(at < 32 * i, jnp.uint32(0), lower)
-            below += lax.population_count(words[..., i] & lower).astype(jnp.int32)
-            active |= (at // 32 == i) & ((words[..., i] >> bit) & 1 == 1)
-        active &= inside & (z >= 0) & (z < depth)
-        found.append(jnp.where(active, start + below, slots))
-    return jnp.stack(found, 1).reshape(corner.shape[0], -1)
+    """Slots of the inputs at o * stride - padding + k of every output o."""
+    real = (out_sites.keys != NO_SITE)[:, None]
+    axes = [
+        jnp.where(real, o[:, None] * s - p + jnp.arange(k, dtype=jnp.int32)[None], -1)
+        for o, k, s, p in zip(coordinates_of(out_sites.keys, out_shape).T, kernel, stride, padding, strict=True)
+    ]
+    return slots_at(sites, *axes, shape=shape)
+
+
+def _outputs(
+    sites: Sites, out_sites: Sites, *, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple
+) -> Int[Array, "U K"]:
+    """Slots of the outputs at (i + padding - k) / stride of every input i, where that is whole."""
+    real = (sites.keys != NO_SITE)[:, None]
+    axes = []
+    for i, k, s, p in zip(coordinates_of(sites.keys, shape).T, kernel, stride, padding, strict=True):
+        shifted = i[:, None] + p - jnp.arange(k, dtype=jnp.int32)[None]
+        axes.append(jnp.where(real & (shifted % s == 0), shifted // s, -1))
+    return slots_at(out_sites, *axes, shape=out_shape)
 
 
 def flatten_scenes(table: NeighbourTable) -> NeighbourTable:
@@ -246,8 +141,15 @@ def _blocks(index: Int[Array, "V K"], absent: int, rows: int) -> tuple[Array, Ar
 
 def _gathered(features: Float[Array, "U1 C"], index: Int[Array, "V K"], start: Array, rows: int) -> Array:
     """The inputs of one block of rows, [rows, K * C]; the last feature row is zero and stands for 'none'."""
-    block = lax.dynamic_slice_in_dim(index, start, rows)
-    return jnp.asarray(features).at[block].get(mode="promise_in_bounds").reshape(rows, -1)
+    columns, channels = index.shape[1], features.shape[1]
+
+    def gather(start: Array) -> Array:
+        block = lax.dynamic_slice_in_dim(index, start, rows).reshape(-1)
+        return jnp.asarray(features).at[block].get(mode="promise_in_bounds")
+
+    # Always true. XLA does not fuse across a branch: fused with the reshape, a CPU gathers one float at a time.
+    whole = lax.cond(start >= 0, gather, lambda _: jnp.zeros((rows * columns, channels), features.dtype), start)
+    return whole.reshape(rows, -1)
 
 
 @_per_platform
@@ -292,14 +194,3 @@ def _kernel_gradient(features: Array, index: Array, gradient: Array, *, rows: in
 
     zero = jnp.zeros((index.shape[1] * features.shape[1], out), accumulator)
     return lax.fori_loop(jnp.int32(0), occupied, accumulate, zero)
-
-
-def to_dense(features: Float[Array, "V C"], sites: Sites, *, shape: Triple) -> Float[Array, "Z Y X C"]:
-    """The sites' features on the whole grid (z, y, x), zero where no site is active."""
-    depth, height, width = shape
-    cells = depth * height * width
-    # Padding writes outside of the grid, each slot to a place of its own, and is dropped there.
-    place = jnp.where(sites.keys == NO_SITE, cells + jnp.arange(sites.keys.shape[0], dtype=jnp.int32), sites.keys)
-    flat = jnp.zeros((cells, features.shape[-1]), features.dtype)
-    flat = flat.at[place].set(features, mode="drop", unique_indices=True, indices_are_sorted=True)
-    return flat.reshape(height, width, depth, -1).transpose(2, 0, 1, 3)

@@ -1,6 +1,6 @@
 """Sparse 3D convolution by its definition: a dense grid and a mask (DESIGN section 3).
 
-The same functions as in `sparse.py` on whole grids. They are the oracle of the tests and serve small grids.
+What `sites.py` and `sparse.py` compute, on whole grids. They are the oracle of the tests and serve small grids.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float, Int
 
-from ciassd_jax.ops.sparse import NO_SITE, Triple, linear_keys, to_dense
+from ciassd_jax.ops.sites import NO_SITE, Triple, linear_keys, to_dense
 from ciassd_jax.types import Array, Sites
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
-from ciassd_jax.ops.sparse import NO_SITE, Triple, coordinates_of, linear_keys
+from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of, linear_keys
 from ciassd_jax.types import Array, PointCloud, SparseVoxels
 
 Vector = tuple[float, float, float]
@@ -23,11 +24,30 @@ def voxel_coordinates(
     cell border, where a multiplication by the reciprocal would move them to a neighbour.
     """
     offset = points.astype(jnp.float32) - jnp.array(minimum, jnp.float32)[None]
-    # Behind the barrier the compiler sees no constant, and so no reciprocal to multiply by.
-    size = lax.optimization_barrier(jnp.broadcast_to(jnp.array(voxel_size, jnp.float32), offset.shape))
-    index = jnp.floor(offset / size)
+    index = jnp.stack([_floor_of_quotient(offset[:, axis], size) for axis, size in enumerate(voxel_size)], -1)
     inside = ((index >= 0) & (index < jnp.array(cells, jnp.float32)[None])).all(-1)
     return jnp.where(inside[:, None], index, 0).astype(jnp.int32)[:, ::-1], inside
+
+
+def _floor_of_quotient(values: Float[Array, " P"], divisor: float) -> Float[Array, " P"]:
+    """floor(values / divisor) of the division that IEEE 754 defines, for results of 0 to 2**16; else negative or above.
+
+    Compilers divide by a constant, or by a vector that they broadcast, as a product with its reciprocal, and
+    accelerators may approximate. Here their quotient only names the nearest whole number n; whether it is reached, with
+    values / divisor rounded to nearest, follows from n * divisor - values, of which every step is exact.
+    """
+    size = np.float32(divisor)
+    nearest = jnp.round(values / size)
+    # Half the distance from n to the float below: a quotient that lacks no more is rounded up to n.
+    slack = (nearest - jnp.nextafter(nearest, jnp.zeros_like(nearest))) / 2 * size
+    missing, rest = -values, size
+    for _ in range(3):
+        # Eight bits of the divisor at a time: their product with n needs no rounding.
+        exponent = np.frexp(rest)[1] - 8
+        part = np.float32(np.ldexp(np.trunc(np.ldexp(rest, -exponent)), exponent))
+        missing = missing + nearest * part
+        rest = rest - part
+    return jnp.where(missing <= slack, nearest, nearest - 1)
 
 
 def voxelize(

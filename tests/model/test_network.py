@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ciassd_jax import config as presets
+from ciassd_jax import presets
+from ciassd_jax.config import Config
 from ciassd_jax.model.backbone import SPConvNet
 from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import postprocess, predict, predict_raw, voxelize_batch
@@ -30,12 +31,12 @@ def run_one(variables, cloud):
     return raw, postprocess(raw, cloud, TINY)
 
 
-def dense(config: presets.Config) -> presets.Config:
+def dense(config: Config) -> Config:
     return replace(config, backbone=replace(config.backbone, backend="dense"))
 
 
 @cache
-def shapes_of(config: presets.Config) -> dict:
+def shapes_of(config: Config) -> dict:
     return jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
 
 

@@ -210,7 +210,7 @@ def test_greedy_keeps_nothing_of_nothing():
 
 
 @pytest.mark.parametrize("slots", [1, 127, 128, 129, 300])
-def test_pairwise_overlap_across_tiles(slots):
+def test_pairwise_overlap_across_blocks(slots):
     rng = np.random.default_rng(slots)
     boxes = np.zeros((slots, 7), np.float32)
     # Dense enough that boxes of every pair of tiles overlap.

@@ -11,8 +11,9 @@ import pytest
 from jax.test_util import check_grads
 from oracles import sparse_convolution_loop
 
+from ciassd_jax.ops import sites as site_ops
 from ciassd_jax.ops import sparse, sparse_dense
-from ciassd_jax.ops.sparse import NO_SITE
+from ciassd_jax.ops.sites import NO_SITE
 from ciassd_jax.types import NeighbourTable, Sites
 
 
@@ -49,13 +50,13 @@ def by_key(coordinates: np.ndarray) -> np.ndarray:
 
 
 def sites_of(coordinates: np.ndarray, shape, capacity: int) -> Sites:
-    keys = np.asarray(sparse.linear_keys(jnp.array(coordinates), shape))
+    keys = np.asarray(site_ops.linear_keys(jnp.array(coordinates), shape))
     padding = np.full(capacity - len(keys), NO_SITE, np.int32)
-    return Sites(jnp.concatenate([keys, padding]), jnp.int32(len(keys)))
+    return active_sites(jnp.concatenate([keys, padding]), shape=shape)
 
 
 def coordinates_of(sites: Sites, shape) -> np.ndarray:
-    return np.asarray(sparse.coordinates_of(sites.keys, shape))[: int(sites.count)]
+    return np.asarray(site_ops.coordinates_of(sites.keys, shape))[: int(sites.count)]
 
 
 def random_features(seed: int, rows: int, channels: int = CHANNELS[0]) -> jax.Array:
@@ -75,7 +76,7 @@ def gathered_layer(sites, features, kernel, shape, geometry, capacity):
     if geometry == SUBMANIFOLD:
         return sites, jnp.int32(0), sparse.convolve(features, sparse.submanifold_table(sites, shape=shape), kernel)
     where = {"shape": shape, "out_shape": geometry.out_shape(shape), **geometry._asdict()}
-    out_sites, dropped = sparse.strided_sites(sites, capacity=capacity, **where)
+    out_sites, dropped = site_ops.strided_sites(sites, capacity=capacity, **where)
     return out_sites, dropped, sparse.convolve(features, sparse.strided_table(sites, out_sites, **where), kernel)
 
 
@@ -95,12 +96,13 @@ def flat_layer(sites, features, kernel, shape, geometry, capacity):
         tables = jax.vmap(partial(sparse.submanifold_table, shape=shape))(sites)
         return sites, jnp.zeros(1, jnp.int32), sparse.convolve(features, sparse.flatten_scenes(tables), kernel)
     where = {"shape": shape, "out_shape": geometry.out_shape(shape), **geometry._asdict()}
-    out_sites, dropped = jax.vmap(partial(sparse.strided_sites, capacity=capacity, **where))(sites)
+    out_sites, dropped = jax.vmap(partial(site_ops.strided_sites, capacity=capacity, **where))(sites)
     tables = jax.vmap(partial(sparse.strided_table, **where))(sites, out_sites)
     return out_sites, dropped, sparse.convolve(features, sparse.flatten_scenes(tables), kernel)
 
 
 run_gathered = partial(jax.jit, static_argnames=("shape", "geometry", "capacity"))(gathered_layer)
+active_sites = partial(jax.jit, static_argnames="shape")(site_ops.active_sites)
 submanifold_table = partial(jax.jit, static_argnames="shape")(sparse.submanifold_table)
 run_dense = partial(jax.jit, static_argnames=("shape", "geometry", "capacity"))(dense_layer)
 run_batch = partial(jax.jit, static_argnames=("shape", "geometry", "capacity"))(flat_layer)
@@ -285,8 +287,10 @@ def test_grids_of_more_rows_than_one_block(number):
     sites, features = sites_of(coordinates, shape, capacity), random_features(1, capacity)
     for geometry in (SUBMANIFOLD, DOWN):
         arguments = sites, features, random_kernels(2, (geometry,))[0], shape, geometry, capacity
-        for mine, reference in zip(run_gathered(*arguments), run_dense(*arguments), strict=True):
-            jax.tree.map(partial(np.testing.assert_allclose, rtol=0, atol=1e-5), mine, reference)
+        (mine, *gathered), (reference, *dense) = run_gathered(*arguments), run_dense(*arguments)
+        np.testing.assert_array_equal(mine.keys, reference.keys)
+        for values, expected in zip(gathered, dense, strict=True):
+            np.testing.assert_allclose(values, expected, rtol=0, atol=1e-5)
 
 
 def test_a_batch_is_its_scenes():
@@ -403,31 +407,32 @@ def test_keys_and_coordinates_are_inverse(shape):
     number = min(np.prod(shape), 1000)
     coordinates = random_coordinates(0, shape, number)
     coordinates[[0, -1]] = [0, 0, 0], np.array(shape) - 1
-    keys = sparse.linear_keys(jnp.array(coordinates), shape)
+    keys = site_ops.linear_keys(jnp.array(coordinates), shape)
     assert keys.dtype == jnp.int32
     assert (np.diff(keys) > 0).all()
     assert keys[-1] == np.prod(shape) - 1
-    np.testing.assert_array_equal(sparse.coordinates_of(keys, shape), coordinates)
+    np.testing.assert_array_equal(site_ops.coordinates_of(keys, shape), coordinates)
 
 
-@pytest.mark.parametrize("capacity", [1, 12, 60])
-def test_sort_unique(capacity):
-    find = jax.jit(partial(sparse.sort_unique, capacity=capacity))
-    for number in (0, 1, 12, 40):
-        keys = np.full(49, NO_SITE)
-        keys[:number] = np.random.default_rng(number).integers(0, 15, number)
-        sites, dropped = find(np.random.default_rng(1).permutation(keys))
-        distinct = np.unique(keys[:number])
-        assert sites.count == min(len(distinct), capacity)
-        assert dropped == max(len(distinct) - capacity, 0)
-        expected = np.concatenate([distinct, np.full(capacity, NO_SITE)])[:capacity]
-        np.testing.assert_array_equal(sites.keys, expected)
+@pytest.mark.parametrize("capacity", [1, 5, 12, 300])
+@pytest.mark.parametrize("shape", [(13, 7, 9), (70, 3, 4)])
+def test_the_map_of_strided_sites_is_that_of_their_list(shape, capacity):
+    """Dropped sites are in neither, even where a column loses only some of its own."""
+    where = {"shape": shape, "out_shape": DOWN.out_shape(shape), **DOWN._asdict()}
+    find = jax.jit(partial(site_ops.strided_sites, capacity=capacity, **where))
+    for number in (0, 1, 30, 200):
+        sites, _ = find(sites_of(random_coordinates(number, shape, number), shape, 250))
+        listed = active_sites(sites.keys, shape=where["out_shape"])
+        occupied = np.asarray(listed.columns)[:, :-1].any(1)
+        np.testing.assert_array_equal(np.asarray(sites.columns)[:, :-1], np.asarray(listed.columns)[:, :-1])
+        np.testing.assert_array_equal(np.asarray(sites.columns)[occupied], np.asarray(listed.columns)[occupied])
+        assert sites.count == listed.count
 
 
 def test_to_dense_puts_each_site_in_its_place():
     shape, number = (3, 4, 5), 17
     coordinates, features = random_coordinates(0, shape, number), random_features(1, 30)
-    grid = sparse.to_dense(features, sites_of(coordinates, shape, 30), shape=shape)
+    grid = site_ops.to_dense(features, sites_of(coordinates, shape, 30), shape=shape)
     expected = np.zeros((*shape, features.shape[1]), np.float32)
     expected[tuple(coordinates.T)] = features[:number]
     np.testing.assert_array_equal(grid, expected)

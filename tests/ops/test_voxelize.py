@@ -11,16 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import VoxelsByLoop, voxelize_loop
 
-from ciassd_jax import config
-from ciassd_jax.ops.voxelize import voxel_coordinates, voxelize
+from ciassd_jax import presets
+from ciassd_jax.ops.voxelize import _floor_of_quotient, voxel_coordinates, voxelize
 from ciassd_jax.types import PointCloud, SparseVoxels
 
 ROWS = 256
+floor_of_quotient = jax.jit(_floor_of_quotient, static_argnums=1)
 # 6 x 5 x 4 voxels whose sizes are no binary fractions; one empty layer on top, as in the network.
 GRID = {"minimum": (-1.0, -0.5, -2.0), "voxel_size": (0.3, 0.2, 0.7), "cells": (6, 5, 4)}
 MINIMUM, SIZE, CELLS = (np.array(GRID[k], np.float32) for k in ("minimum", "voxel_size", "cells"))
 SHAPE = (5, 5, 6)
-CAR = config.car_released().grid
+CAR = presets.car_released().grid
 CAR_GRID = {"minimum": CAR.minimum, "voxel_size": CAR.voxel_size, "cells": CAR.cells}
 
 
@@ -168,8 +169,8 @@ def millimetre_points(number: int = 20_000) -> np.ndarray:
     return (steps / 1000).astype(np.float32)
 
 
-@pytest.mark.parametrize("vmapped", [False, True])
-def test_cell_index_is_a_true_float32_division(vmapped):
+@pytest.mark.parametrize("scenes", [None, 1, 4])
+def test_cell_index_is_a_true_float32_division(scenes):
     points = millimetre_points()
     minimum, size = np.float32(CAR.minimum), np.float32(CAR.voxel_size)
     offset = points - minimum
@@ -180,13 +181,27 @@ def test_cell_index_is_a_true_float32_division(vmapped):
     assert (np.floor(in_float64) != expected).any(-1).sum() > 50
 
     locate = partial(voxel_coordinates, **CAR_GRID)
-    if vmapped:
-        coordinates, inside = jax.tree.map(lambda a: a[0], jax.jit(jax.vmap(locate))(points[None]))
+    if scenes:
+        batch = jax.jit(jax.vmap(locate))(points.reshape(scenes, -1, 3))
+        coordinates, inside = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in batch)
     else:
         coordinates, inside = jax.jit(locate)(points)
     real = ((expected >= 0) & (expected < CAR.cells)).all(-1)
     np.testing.assert_array_equal(inside, real)
     np.testing.assert_array_equal(np.asarray(coordinates)[real], expected[real][:, ::-1])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.sampled_from([0.05, 0.075, 0.1, 0.16, 0.3, 1.0]), st.integers(0, 2**31))
+def test_the_nearest_floats_to_a_border_fall_on_their_side(size, seed):
+    """A few floats around n * size, and millimetres; denormal numbers are left out, which XLA flushes to zero."""
+    rng = np.random.default_rng(seed)
+    values = (rng.integers(1, 1600, 4000) * size).astype(np.float32)
+    for _ in range(3):
+        values = np.nextafter(values, values + rng.integers(-1, 2, 4000)).astype(np.float32)
+    values[:1000] = np.round(rng.uniform(0, 70, 1000), 3)
+    expected = np.floor(values / np.float32(size))
+    np.testing.assert_array_equal(floor_of_quotient(values, size), expected)
 
 
 def test_range_is_half_open():
