@@ -30,8 +30,7 @@ def run_demo(file: Path | None, weights: Weights | None, out: Path) -> None:
     print(f"Detecting in {source} of {len(points)} points; the compiler needs a moment.", flush=True)
     if weights is None:
         config = car_lite()
-        # The default generator takes a CPU's compiler four times as long.
-        weights = Weights(init_variables(jax.random.key(0, impl="unsafe_rbg"), config), config, [])
+        weights = Weights(init_variables(jax.random.key(0), config), config, [])
     result = Detector(weights.variables, weights.config).detect(points)
     print(result)
     written = [write_json(out / f"{name}.json", result)]

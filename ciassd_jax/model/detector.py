@@ -49,4 +49,8 @@ def init_variables(key: Array, config: Config) -> Any:
         points_in_range=none,
         points_dropped=none,
     )
-    return jax.jit(CIASSD(config).init)(key, voxels)
+    init = CIASSD(config).init
+    if isinstance(key, jax.core.Tracer):
+        return init(key, voxels)
+    # Run once, so the time is in the compiler: without optimisation it takes a fifth.
+    return jax.jit(init, compiler_options={"xla_backend_optimization_level": 0})(key, voxels)
