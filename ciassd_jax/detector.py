@@ -15,6 +15,7 @@ import numpy as np
 
 from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.points import scale_intensity
 from ciassd_jax.prediction import predict, variables_of
 from ciassd_jax.types import Array, Counts, PointCloud, Variables
 from ciassd_jax.weights import load_weights
@@ -167,16 +168,13 @@ def _check_points(points: np.ndarray) -> np.ndarray:
     """Points as float32 [N, 4] with intensity in [0, 1]."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"points have the shape {points.shape}; give [N, 4]: x, y, z in metres and intensity.")
-    points = np.asarray(points, np.float32)
-    intensity = points[:, 3]
-    top = intensity.max(initial=0, where=np.isfinite(intensity))
-    if top > 2:
+    points, top = scale_intensity(np.asarray(points, np.float32))
+    if top is not None:
         warnings.warn(
             f"{len(points)} intensities of up to {top:g} were divided by 255: the network reads [0, 1].",
             DroppedWarning,
             stacklevel=4,
         )
-        points = np.concatenate([points[:, :3], points[:, 3:] / 255], 1)
     return points
 
 

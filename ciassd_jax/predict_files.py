@@ -8,9 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Int
+
 from ciassd_jax.detector import Detector, FrameResult
 from ciassd_jax.formats.errors import FormatError, FormatWarning, Pathlike, read_bytes
-from ciassd_jax.formats.kitti import boxes_to_rows, write_rows
+from ciassd_jax.formats.kitti import ObjectRow, boxes_to_rows, write_rows
 from ciassd_jax.formats.kitti_camera import Camera, read_camera, view_planes
 from ciassd_jax.formats.points import POINT_SUFFIXES, read_points
 from ciassd_jax.formats.writing import replacing
@@ -42,10 +45,17 @@ def find_frames(
 
 def detect_frame(detector: Detector, frame: Frame) -> FrameResult:
     """Read the points of a frame and detect; with a camera, only boxes in its view."""
-    points = read_points(frame.cloud)
-    if frame.camera is None:
-        return detector.detect(points)
-    return detector.detect(points, frustum=view_planes(frame.camera))
+    return detect_in_view(detector, read_points(frame.cloud), frame.camera)
+
+
+def detect_in_view(detector: Detector, points: np.ndarray, camera: Camera | None) -> FrameResult:
+    """Detect in points [N, 4]; with a camera, only boxes in its view."""
+    return detector.detect(points, frustum=None if camera is None else view_planes(camera))
+
+
+def result_rows(result: FrameResult, camera: Camera) -> tuple[list[ObjectRow], Int[np.ndarray, " kept"]]:
+    """KITTI's rows of the boxes seen in the image, and the indices of those boxes."""
+    return boxes_to_rows(Boxes.from_array(result.boxes), result.scores, result.labels, *camera)
 
 
 def write_frame(frame: Frame, result: FrameResult, folder: Pathlike) -> list[Path]:
@@ -55,13 +65,7 @@ def write_frame(frame: Frame, result: FrameResult, folder: Pathlike) -> list[Pat
     """
     written = [write_json(Path(folder) / f"{frame.cloud.stem}.json", result)]
     if frame.camera is not None:
-        rows, _ = boxes_to_rows(
-            Boxes.from_array(result.boxes),
-            result.scores,
-            result.labels,
-            frame.camera.calibration,
-            frame.camera.image_size,
-        )
+        rows, _ = result_rows(result, frame.camera)
         written.append(Path(folder) / f"{frame.cloud.stem}.txt")
         with replacing(written[-1]) as temporary:
             write_rows(temporary, rows)

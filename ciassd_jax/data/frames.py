@@ -13,6 +13,7 @@ from jaxtyping import Float32, Int
 
 from ciassd_jax.formats.errors import FormatWarning, Pathlike
 from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.points import scale_intensity
 from ciassd_jax.types import Boxes
 
 
@@ -72,9 +73,8 @@ def clean_points(points: Float32[np.ndarray, "N 4"], path: Pathlike) -> Float32[
         text = f"{path}: {(~finite).sum()} of {len(points)} points are not finite; they were left out."
         warnings.warn(text, FormatWarning, stacklevel=3)
         points = points[finite]
-    top = points[:, 3].max(initial=0)
-    if top > 2:
+    points, top = scale_intensity(points)
+    if top is not None:
         text = f"{path} has intensities of up to {top:g}; they were divided by 255, as they should lie in [0, 1]."
         warnings.warn(text, FormatWarning, stacklevel=3)
-        points = np.concatenate([points[:, :3], points[:, 3:] / np.float32(255)], 1)
     return points

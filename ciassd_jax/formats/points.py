@@ -1,6 +1,6 @@
 """Point clouds in `.bin` (KITTI), `.npy`, `.npz` and `.pcd` files.
 
-Readers return what the file says; cleaning (NaN, intensity of 0..255) is left to the caller.
+Readers return what the file says; cleaning (NaN, `scale_intensity`) is left to the caller.
 """
 
 from __future__ import annotations
@@ -56,6 +56,15 @@ def read_points(path: Pathlike, width: int = 4) -> Float32[np.ndarray, "N 4"]:
 def write_bin(path: Pathlike, points: Float[np.ndarray, "N 4"]) -> None:
     """Write (x, y, z, intensity) as little-endian float32, KITTI's `.bin`."""
     Path(path).write_bytes(points.astype("<f4").tobytes())
+
+
+def scale_intensity(points: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, "N 4"], float | None]:
+    """Points with intensity in [0, 1]: divided by 255 where it exceeds 2; then also its largest value before."""
+    intensity = points[:, 3]
+    top = float(intensity.max(initial=0, where=np.isfinite(intensity)))
+    if top <= 2:
+        return points, None
+    return np.concatenate([points[:, :3], points[:, 3:] / np.float32(255)], 1), top
 
 
 def _as_points(array: np.ndarray, path: Pathlike) -> Float32[np.ndarray, "N 4"]:
