@@ -19,6 +19,7 @@ LAYERS = [
         "export",
         "info",
         "predict_files",
+        "scoring",
         "check",
         "submission",
         "demo",

@@ -1,15 +1,23 @@
 """`ciassd eval`, called in this process and, to see that no device starts, in its own."""
 
 import json
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from mini_folders import NAMES, write_custom, write_kitti, write_split
+from small import random_variables, share_programs, small_config
 
+from ciassd_jax import save_weights
 from ciassd_jax.cli import main
 from ciassd_jax.evaluation import evaluate, read_folders, to_json
 from ciassd_jax.formats.kitti import ObjectRow, write_rows
+
+pytestmark = pytest.mark.xdist_group("detector")
 
 
 @pytest.fixture
@@ -70,7 +78,7 @@ def test_bad_input_is_one_sentence(
 
 def test_nothing_to_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval"]) == 2
-    assert "ciassd eval txt LABELS RESULTS" in capsys.readouterr().err
+    assert "--weights FILE or --workdir FOLDER, or compare files with `ciassd eval txt" in capsys.readouterr().err
 
 
 def test_starts_no_device(folders: tuple[Path, Path]) -> None:
@@ -82,3 +90,112 @@ def test_starts_no_device(folders: tuple[Path, Path]) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "3d   AP:" in done.stdout
+
+
+@pytest.fixture
+def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Weights in the folder of a training, beside a KITTI folder with a split of two of its frames."""
+    share_programs(monkeypatch)
+    save_weights(tmp_path / "run/last.safetensors", random_variables(small_config()), small_config())
+    write_split(write_kitti(tmp_path / "kitti"), "val", *NAMES[:2])
+    return tmp_path
+
+
+def test_a_network_is_evaluated_and_its_files_evaluate_alike(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = work / "new/out"
+    weights = work / "run/last.safetensors"
+    assert main(["eval", "--weights", str(weights), "--data", str(work / "kitti"), "--out", str(out)]) == 0
+    shown, said = capsys.readouterr()
+    assert re.sub(r".*\r", "", said).count("\n") == 1
+    assert "2/2" in said
+    *table, counts, done = shown.splitlines()
+    assert re.fullmatch(r"2 frames, \d+ boxes, \d+ ms a frame without reading and compilation\.", counts)
+    assert done == f"Wrote {out}."
+    assert (out / "table.log").read_text().splitlines() == table[:-1]
+    assert "By number of points, AP (R40)" in table
+    assert sorted(path.name for path in out.iterdir()) == ["000000.txt", "000001.txt", "result.json", "table.log"]
+    assert sum(len((out / f"{name}.txt").read_text().splitlines()) for name in NAMES[:2]) == int(counts.split()[2]) > 0
+    labels = work / "kitti/training/label_2"
+    assert main(["eval", "txt", str(labels), str(out), "--json", str(work / "txt.json")]) == 0
+    # Equal but for the four decimals of the files.
+    one, other = (json.loads(path.read_text())["Car"] for path in (out / "result.json", work / "txt.json"))
+    assert one["bbox"]["R40"]["0.70"] == pytest.approx(other["bbox"]["R40"]["0.70"], abs=0.05)
+    assert one["3d"]["R40"]["0.50"] == pytest.approx(other["3d"]["R40"]["0.50"], abs=0.05)
+
+
+def test_the_weights_of_a_training_and_the_environments_data(
+    work: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("KITTI_ROOT", str(write_custom(work / "custom")))
+    out = work / "result.json"
+    arguments = ["eval", "--workdir", str(work / "run"), "--split", "train", "--json", str(out)]
+    assert main([*arguments, "--score-threshold", "0.99"]) == 0
+    shown, _ = capsys.readouterr()
+    assert "2 frames, 0 boxes, " in shown
+    assert shown.endswith(f"Wrote {out}.\n")
+    assert json.loads(out.read_text())["Car"]["3d"]["R40"]["0.70"] is None
+    assert main(arguments) == 0
+    shown, _ = capsys.readouterr()
+    assert "No camera: difficulty is by the number of points" in shown
+    assert json.loads(out.read_text())["Car"]["3d"]["R40"]["0.70"] is not None
+
+
+def with_cut_cloud(root: Path, name: str) -> Path:
+    path = root / f"training/velodyne/{name}.bin"
+    path.write_bytes(path.read_bytes()[:-3])
+    return root
+
+
+def without_labels(root: Path) -> Path:
+    write_split(write_kitti(root, part="testing"), "test", NAMES[1])
+    return root
+
+
+Change = Callable[[Path], dict[str, Any]]
+# Options that stand in for the good ones, and what the sentence must say.
+BAD: dict[str, tuple[Change, str]] = {
+    "both": (lambda w: {"workdir": w / "run"}, r"Give either --weights FILE or --workdir FOLDER"),
+    "no weights": (lambda w: {"weights": w / "none.safetensors"}, r"none\.safetensors is no file; check the path"),
+    "no training": (
+        lambda w: {"weights": None, "workdir": w / "kitti"},
+        r"kitti has neither best\.safetensors nor last\.safetensors",
+    ),
+    "another config": (lambda w: {"preset": "car"}, r"holds weights for another config: .*; leave out --preset"),
+    "threshold": (lambda w: {"score-threshold": 1.5}, r"score_threshold: 1\.5 is outside"),
+    "no data": (lambda w: {"data": w / "none"}, r"none has no folder training or testing \(KITTI\) or points"),
+    "no split": (lambda w: {"split": "mine"}, r"ImageSets/mine\.txt does not exist; write it"),
+    "absent frames": (lambda w: {"split": "train"}, r"3711 of 3712 frames have no cloud .*; copy them, or list"),
+    "out is a file": (lambda w: {"out": w / "run/last.safetensors"}, r"last\.safetensors cannot be a folder"),
+    "json below a file": (lambda w: {"json": w / "run/last.safetensors/a.json"}, r"cannot be a folder"),
+    "cut cloud": (
+        lambda w: {"data": with_cut_cloud(w / "kitti", NAMES[1])},
+        rf"velodyne/{NAMES[1]}\.bin has \d+ bytes, not a multiple of 16",
+    ),
+    "unlabelled": (
+        lambda w: {"data": without_labels(w / "unlabelled"), "split": "test"},
+        r"Frame 000001 has no labels to compare with",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_options_are_one_sentence_and_leave_nothing(
+    name: str, work: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change, message = BAD[name]
+    options = {"weights": work / "run/last.safetensors", "data": work / "kitti", "out": work / "out"} | change(work)
+    before = sorted(work.rglob("*"))
+    given = [part for key, value in options.items() if value is not None for part in (f"--{key}", str(value))]
+    assert main(["eval", *given]) == 2
+    shown, said = capsys.readouterr()
+    *bar, sentence = said.splitlines()
+    assert re.fullmatch(rf"error: .*{message}.*", sentence)
+    # The frames themselves are read while the bar runs.
+    assert not bar or name in ("unlabelled", "cut cloud")
+    assert shown == ""
+    assert sorted(work.rglob("*")) == before
+
+
+def test_files_take_no_option_of_a_network(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", "--split", "train", "txt", *map(str, folders)]) == 2
+    assert capsys.readouterr().err.startswith("error: `ciassd eval txt` compares files, so its only option is --json")

@@ -1,15 +1,21 @@
-"""The command eval: AP by KITTI's official rules."""
+"""The command eval: AP by KITTI's official rules, of a network or of result files."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from ciassd_jax.cli.inference import Preset, load_as, override
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
+
+if TYPE_CHECKING:
+    from ciassd_jax.evaluation import Evaluation
+    from ciassd_jax.scoring import ScoredFrame
 
 
 @dataclass(frozen=True)
@@ -24,34 +30,128 @@ class Text:
     """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
 
     def run(self) -> int:
-        from ciassd_jax.evaluation import evaluate, format_block, format_tables, read_folders, to_json
-        from ciassd_jax.formats.writing import check_folder, replacing
+        from ciassd_jax.evaluation import evaluate, read_folders
+        from ciassd_jax.formats.writing import check_folder
 
         if self.json is not None:
             check_folder(self.json.parent)
         with warnings_as_lines(self.results):
             truths, detections = read_folders(self.labels, self.results)
         evaluation = evaluate(truths, detections)
-        print(f"{format_block(evaluation)}\n\n{format_tables(evaluation)}".strip())
+        print(_text(evaluation))
         if self.json is not None:
-            with replacing(self.json) as path:
-                path.write_text(json.dumps(to_json(evaluation), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            _write(self.json, _json(evaluation))
             print(f"Wrote {self.json}.")
         return 0
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Average precision by KITTI's official rules: 2D, bird's-eye view, 3D and orientation."""
+    """Average precision by KITTI's official rules, in 2D, bird's-eye view, 3D and of orientation.
 
+    Of a network: name its weights with --weights or --workdir. Of files: eval txt LABELS RESULTS.
+    """
+
+    weights: Path | None = None
+    """Weights: a file that training or `ciassd convert` wrote, a released .pth, or the name of bundled ones."""
+    workdir: Path | None = None
+    """Or the folder of a training, whose best weights are taken."""
+    data: Path | None = None
+    """Folder in KITTI's or OpenPCDet's custom layout; KITTI_ROOT without it."""
+    split: str = "val"
+    """train, val, trainval, all or a file of ImageSets."""
+    image_size: tuple[int, int] | None = None
+    """Width and height of the images in pixels, for cameras that KITTI does not have."""
+    out: Path | None = None
+    """Folder for NAME.txt of every frame with its detections, result.json and table.log."""
+    json: Path | None = None
+    """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
+    preset: Preset | None = None
+    """Use this preset instead of the config in the weights file; the parameters must fit."""
+    score_threshold: float | None = None
+    """Class probability that a candidate needs (the preset's: 0.3)."""
     source: Annotated[
-        Annotated[Text, tyro.conf.subcommand("txt")]
-        | Annotated[None, tyro.conf.subcommand("network", description="A trained network; cannot be evaluated yet.")],
+        Annotated[Text, tyro.conf.subcommand("txt")] | Annotated[None, tyro.conf.subcommand("network")],
         tyro.conf.arg(name=""),
     ] = None
     """What made the detections."""
 
     def run(self) -> int:
         if self.source is None:
-            raise UsageError("There is nothing to evaluate; say `ciassd eval txt LABELS RESULTS`.")
+            return self._network()
+        if replace(self, source=None) != Evaluate():
+            raise UsageError("`ciassd eval txt` compares files, so its only option is --json, after LABELS RESULTS.")
         return self.source.run()
+
+    def _network(self) -> int:
+        from ciassd_jax.data.folders import find_root, open_dataset
+        from ciassd_jax.detector import Detector
+        from ciassd_jax.formats.writing import check_folder
+        from ciassd_jax.scoring import detect_dataset, score_frames
+
+        weights = load_as(self._weights(), self.preset)
+        config = override(weights.config, None, self.score_threshold)
+        root = find_root(self.data)
+        for folder in (self.out, self.json and self.json.parent):
+            if folder is not None:
+                check_folder(folder)
+        with warnings_as_lines(root):
+            dataset = open_dataset(root, self.split, self.image_size)
+            frames = detect_dataset(Detector(weights.variables, config), dataset, _progress)
+        evaluation = score_frames(frames)
+        print(_text(evaluation))
+        boxes, seconds = sum(len(frame.lines) for frame in frames), sum(frame.result.seconds for frame in frames)
+        milliseconds = f"{1e3 * seconds / len(frames):.0f} ms a frame"
+        print(f"\n{len(frames)} frames, {boxes} boxes, {milliseconds} without reading and compilation.")
+        self._write(frames, evaluation)
+        return 0
+
+    def _weights(self) -> Path:
+        from ciassd_jax.scoring import find_trained
+
+        if self.weights is not None and self.workdir is None:
+            return self.weights
+        if self.workdir is not None and self.weights is None:
+            return find_trained(self.workdir)
+        raise UsageError(
+            "Give either --weights FILE or --workdir FOLDER, or compare files with `ciassd eval txt LABELS RESULTS`."
+        )
+
+    def _write(self, frames: Sequence[ScoredFrame], evaluation: Evaluation) -> None:
+        from ciassd_jax.scoring import write_frames
+
+        if self.out is not None:
+            write_frames(frames, self.out)
+            _write(self.out / "result.json", _json(evaluation))
+            # A .txt would be a frame to whatever reads the folder.
+            _write(self.out / "table.log", _text(evaluation))
+        if self.json is not None:
+            _write(self.json, _json(evaluation))
+        written = [str(path) for path in (self.out, self.json) if path is not None]
+        if written:
+            print(f"Wrote {' and '.join(written)}.")
+
+
+def _progress(names: Sequence[str]) -> Iterable[str]:
+    from tqdm.auto import tqdm
+
+    return tqdm(names, unit="frame")
+
+
+def _text(evaluation: Evaluation) -> str:
+    from ciassd_jax.evaluation import format_block, format_tables
+
+    return f"{format_block(evaluation)}\n\n{format_tables(evaluation)}".strip()
+
+
+def _json(evaluation: Evaluation) -> str:
+    from ciassd_jax.evaluation import to_json
+
+    return json.dumps(to_json(evaluation), indent=1, allow_nan=False)
+
+
+def _write(path: Path, text: str) -> None:
+    from ciassd_jax.formats.writing import replacing
+
+    with replacing(path) as temporary:
+        temporary.write_text(f"{text}\n", encoding="utf-8")

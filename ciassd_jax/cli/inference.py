@@ -50,8 +50,8 @@ class Predict:
         from ciassd_jax.predict_files import find_frames
 
         frames = find_frames(self.path, calib=self.calib, image_size=self.image_size)
-        weights = _load(self.weights, self.preset)
-        config = _overridden(weights.config, self.dtype, self.score_threshold)
+        weights = load_as(self.weights, self.preset)
+        config = override(weights.config, self.dtype, self.score_threshold)
         check_folder(self.out)
         detector = Detector(weights.variables, config)
         if self.path.is_dir():
@@ -128,7 +128,7 @@ class Info:
     def run(self) -> int:
         from ciassd_jax import info
 
-        config = _load(self.weights, self.preset).config if self.weights else PRESETS[self.preset or "car"]()
+        config = load_as(self.weights, self.preset).config if self.weights else PRESETS[self.preset or "car"]()
         facts = {
             "config": json.loads(config.to_json()),
             "parameters": info.count_parameters(config),
@@ -166,12 +166,12 @@ class Demo:
         from ciassd_jax.demo import run_demo
 
         with warnings_as_lines(self.file or "synthetic scene"):
-            weights = _load(self.weights, None) if self.weights else None
+            weights = load_as(self.weights, None) if self.weights else None
             run_demo(self.file, weights, self.out)
         return 0
 
 
-def _load(path: Path, preset: str | None) -> Weights:
+def load_as(path: Path, preset: str | None) -> Weights:
     """The weights, with the preset's config in place of their own where one is asked for."""
     from ciassd_jax.detector import find_weights
     from ciassd_jax.weights import check_fits, load_weights
@@ -184,7 +184,7 @@ def _load(path: Path, preset: str | None) -> Weights:
     return weights._replace(config=config)
 
 
-def _overridden(config: Config, dtype: Literal["float32", "bfloat16"] | None, threshold: float | None) -> Config:
+def override(config: Config, dtype: Literal["float32", "bfloat16"] | None, threshold: float | None) -> Config:
     if dtype is not None:
         config = dataclasses.replace(config, dtype=dtype)
     if threshold is not None:
