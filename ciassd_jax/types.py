@@ -65,7 +65,8 @@ class GroundTruth(NamedTuple):
 class Scene(NamedTuple):
     """A labelled frame, padded: what the loader gives and `train_step` takes.
 
-    `frame` is the frame's place in its data set. `points_cut` and `boxes_cut` count what was over capacity.
+    `frame` is the frame's place in its data set, -1 for a scene that only fills a batch. `points_cut`, `boxes_cut` and
+    `objects_cut` (of those drawn from the ground-truth database) count what was over capacity.
     """
 
     cloud: PointCloud
@@ -73,6 +74,7 @@ class Scene(NamedTuple):
     frame: Int[Array, "*b"]
     points_cut: Int[Array, "*b"]
     boxes_cut: Int[Array, "*b"]
+    objects_cut: Int[Array, "*b"]
 
 
 class PasteObjects(NamedTuple):

@@ -64,6 +64,7 @@ def paste_objects(scene: Scene, objects: PasteObjects, *, paste_up_to: tuple[int
         truth=_pick_truth(truth, kept, scene.truth.label.shape[0]),
         points_cut=scene.points_cut + jnp.maximum(total - capacity, 0),
         boxes_cut=scene.boxes_cut + (accepted & ~pasted).sum(dtype=jnp.int32),
+        objects_cut=scene.objects_cut + objects.cut,
     )
 
 

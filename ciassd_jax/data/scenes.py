@@ -35,6 +35,7 @@ def pad_frame(frame: Frame, index: int, config: Config) -> Scene:
         frame=np.array(index, np.int32),
         points_cut=np.array(len(frame.points) - len(points), np.int32),
         boxes_cut=np.array(len(frame.names) - kept, np.int32),
+        objects_cut=np.array(0, np.int32),
     )
 
 

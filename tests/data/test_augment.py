@@ -80,7 +80,7 @@ def make_scene(points: np.ndarray, boxes: np.ndarray, label: np.ndarray) -> Scen
         np.array(len(boxes), np.int32),
     )
     none = np.array(0, np.int32)
-    return Scene(PointCloud(padded(points, POINTS), np.array(len(points), np.int32)), truth, none, none, none)
+    return Scene(PointCloud(padded(points, POINTS), np.array(len(points), np.int32)), truth, none, none, none, none)
 
 
 def random_scene(seed: int, number: int = 6, reach: float = 6.0) -> Scene:
@@ -225,9 +225,11 @@ def test_pasted_points_come_first_and_covered_ones_leave(seed):
 def test_an_object_without_a_free_box_stays_out_and_is_counted():
     boxes = random_boxes(np.random.default_rng(0), BOXES - 1)
     scene = make_scene(np.full((9, 4), -30, np.float32), boxes, [0] * (BOXES - 1))
-    scene = scene._replace(points_cut=np.array(3, np.int32), boxes_cut=np.array(1, np.int32))
-    result = paste(scene, draws_at([40, 50, 60, 70], (4, 0)))
-    assert (int(result.truth.count), int(result.boxes_cut)) == (BOXES, 1 + 3)
+    cut = {"points_cut": 3, "boxes_cut": 1, "objects_cut": 2}
+    scene = scene._replace(**{name: np.array(number, np.int32) for name, number in cut.items()})
+    draws = draws_at([40, 50, 60, 70], (4, 0))._replace(cut=np.array(5, np.int32))
+    result = paste(scene, draws)
+    assert (int(result.truth.count), int(result.boxes_cut), int(result.objects_cut)) == (BOXES, 1 + 3, 2 + 5)
     assert (int(result.cloud.count), int(result.points_cut)) == (10, 3)
     np.testing.assert_array_equal(real_points(result)[0], [40, 0, 0, 1])
 

@@ -36,7 +36,7 @@ def test_what_fits_is_kept_in_order_and_padding_is_zero() -> None:
     assert scene.cloud.points.shape == (config.data.max_points, 4)
     assert scene.truth.boxes.center.shape == (config.data.max_boxes, 3)
     assert (scene.cloud.count, scene.truth.count, scene.frame) == (50, 5, 3)
-    assert (scene.points_cut, scene.boxes_cut) == (0, 0)
+    assert (scene.points_cut, scene.boxes_cut, scene.objects_cut) == (0, 0, 0)
     np.testing.assert_array_equal(scene.cloud.points[:50], frame.points)
     assert not scene.cloud.points[50:].any()
     np.testing.assert_allclose(scene.truth.boxes.to_array()[:5], frame.boxes.to_array(), rtol=1e-6)

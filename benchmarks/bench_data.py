@@ -1,0 +1,83 @@
+"""How many frames a second does the loader give, with every augmentation?
+
+Command: python benchmarks/bench_data.py [--frames 440] [--batch 4] [--repeats 3] [--shared ../shared]
+
+The train frames of the reference data, again and again, with objects pasted from a database of them; after a first
+batch, so that neither compiling nor starting workers counts. Files come from the page cache. The host's part is
+reading, drawing and padding, the device's augmenting one batch again and again; the loader is both at once, and
+nothing else runs on the device.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from ciassd_jax import car, car_lite, make_batches, open_dataset
+from ciassd_jax.config import Config
+from ciassd_jax.data.batching import Rows, Stream, finish_scenes, host_batches
+from ciassd_jax.data.frames import Dataset
+from ciassd_jax.data.paste import PasteDatabase, build_database, fingerprint_of, open_database
+
+SHARED = Path(__file__).parents[2] / "shared"
+WORKERS = (0, 2)
+
+
+def measure(arguments: argparse.Namespace, next_batch: Callable[[], object]) -> str:
+    """Median and range of the frames a second over the repeats, after one batch."""
+    number, rates = arguments.frames // arguments.batch, []
+    jax.block_until_ready(next_batch())
+    for _ in range(arguments.repeats):
+        start = time.perf_counter()
+        for _ in range(number):
+            jax.block_until_ready(next_batch())
+        rates.append(number * arguments.batch / (time.perf_counter() - start))
+    return f"{statistics.median(rates):6.1f} ({min(rates):.1f} to {max(rates):.1f})"
+
+
+def measure_preset(
+    config: Config, dataset: Dataset, database: PasteDatabase, arguments: argparse.Namespace
+) -> dict[str, str]:
+    """Frames a second of each part."""
+    rows, rates = Rows(Stream(dataset, config, 0, True, database), arguments.batch), {}
+    for workers in WORKERS:
+        host = host_batches(rows, workers=workers)
+        rates[f"host, {workers} workers"] = measure(arguments, lambda host=host: next(host))
+        host.close()
+    few = itertools.cycle([rows.stream.read(position) for position in range(arguments.batch)])
+    batch = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *itertools.islice(few, arguments.batch)))
+    rates["device"] = measure(arguments, lambda: finish_scenes(batch, np.int32(0), config))
+    for workers in WORKERS:
+        numbers = {"seed": 0, "batch_size": arguments.batch, "workers": workers}
+        with make_batches(dataset, config, database=database, **numbers) as batches:
+            rates[f"loader, {workers} workers"] = measure(arguments, lambda batches=batches: next(batches))
+    return rates
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--frames", type=int, default=440)
+    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--shared", type=Path, default=SHARED)
+    arguments = parser.parse_args()
+    dataset = open_dataset(arguments.shared / "kitti", "train")
+    with tempfile.TemporaryDirectory() as folder:
+        build_database(dataset, Path(folder) / "objects.bin")
+        database = open_database(Path(folder) / "objects.bin", fingerprint_of(dataset))
+        print(f"{len(dataset)} frames, batches of {arguments.batch}: frames/s, median (range)")
+        for preset in (car, car_lite):
+            for part, rate in measure_preset(preset(), dataset, database, arguments).items():
+                print(f"{preset.__name__:<10} {part:<18} {rate}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
