@@ -71,6 +71,25 @@ def decode(residuals: Float[Array, "*n 7"], anchors: Boxes) -> Boxes:
     return Boxes(residuals[..., :3] * step + anchors.center, jnp.exp(scale) * anchors.size, r_to_yaw(r))
 
 
+def wrap_r(boxes: Boxes) -> Boxes:
+    """The same boxes with r in [-pi, pi), as truth is encoded (SPEC section 2.2, step 10)."""
+    return boxes._replace(yaw=r_to_yaw(wrap_angle(yaw_to_r(boxes.yaw))))
+
+
+def direction_target(boxes: Boxes) -> Int[Array, "*n"]:
+    """The direction class that says of a box of wrapped r where it looks: 1 if r > 0, else 0 (SPEC section 6.4)."""
+    return (yaw_to_r(boxes.yaw) > 0).astype(jnp.int32)
+
+
+def nearest_aligned(boxes: Boxes) -> tuple[Float[Array, "*n 2"], Float[Array, "*n 2"]]:
+    """Lowest and highest x, y of the footprints once turned to the nearest axis (SPEC section 7.1)."""
+    r = yaw_to_r(boxes.yaw)
+    turned = jnp.abs(r - jnp.floor(r / np.pi + 0.5) * np.pi) > np.pi / 4
+    length, width = boxes.size[..., 0], boxes.size[..., 1]
+    half = jnp.stack([jnp.where(turned, length, width), jnp.where(turned, width, length)], -1) / 2
+    return boxes.center[..., :2] - half, boxes.center[..., :2] + half
+
+
 def apply_direction(boxes: Boxes, direction: Int[Array, "*n"]) -> Boxes:
     """Turn a box by pi where its angle disagrees with the direction class: (r > 0) xor (direction == 1)."""
     turn = (yaw_to_r(boxes.yaw) > 0) != (direction == 1)

@@ -189,6 +189,14 @@ def to_dense(features: Float[Array, "V C"], sites: Sites, *, shape: Triple) -> F
     cells = depth * height * width
     # Padding writes outside of the grid, each slot to a place of its own, and is dropped there.
     place = jnp.where(sites.keys == NO_SITE, cells + jnp.arange(sites.keys.shape[0], dtype=jnp.int32), sites.keys)
-    flat = jnp.zeros((cells, features.shape[-1]), features.dtype)
+    flat = zeros_after(sites.count, (cells, features.shape[-1]), features.dtype)
     flat = flat.at[place].set(features, mode="drop", unique_indices=True, indices_are_sorted=True)
     return flat.reshape(height, width, depth, -1).transpose(2, 0, 1, 3)
+
+
+def zeros_after(count: Int[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
+    """Zeros that cannot be allocated before `count`, which is not negative, is known.
+
+    Plain zeros depend on nothing: XLA sets those of all layers aside at the start, and memory doubles.
+    """
+    return jnp.broadcast_to(jnp.minimum(count, 0).astype(dtype), shape)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float, Int
 
-from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of, slots_at
+from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of, slots_at, zeros_after
 from ciassd_jax.types import Array, NeighbourTable, Sites
 
 # Rows of the output computed at once. On a CPU the gathered block must stay in cache; elsewhere large
@@ -170,7 +170,7 @@ def _gather_multiply(features: Array, index: Array, kernel: Array, *, rows: int)
         )
         return lax.dynamic_update_slice_in_dim(result, product.astype(features.dtype), start, 0)
 
-    empty = jnp.zeros((index.shape[0], out), features.dtype)
+    empty = zeros_after(occupied, (index.shape[0], out), features.dtype)
     return lax.fori_loop(jnp.int32(0), occupied, multiply, empty)[:slots]
 
 
