@@ -221,6 +221,28 @@ class HeadConfig:
 
 
 @dataclass(frozen=True)
+class LossConfig:
+    """Weights beside the classification's 1 (omega, mu, lambda; paper section 3.3) and shapes of the losses."""
+
+    box_weight: float = 2.0
+    direction_weight: float = 0.2
+    iou_weight: float = 1.0
+    focal_alpha: float = 0.25
+    focal_gamma: float = 2.0
+    # Smooth-L1 is quadratic up to an error of 1 / sigma squared.
+    smooth_l1_sigma: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name in ("box_weight", "direction_weight", "iou_weight", "focal_gamma"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"loss.{name}: {getattr(self, name)} must be at least 0 and finite.")
+        if not 0 <= self.focal_alpha <= 1:
+            raise ValueError(f"loss.focal_alpha: {self.focal_alpha} is outside [0, 1].")
+        if not 0 < self.smooth_l1_sigma < math.inf:
+            raise ValueError(f"loss.smooth_l1_sigma: {self.smooth_l1_sigma} must be positive and finite.")
+
+
+@dataclass(frozen=True)
 class DetectionConfig:
     """From raw predictions to boxes (paper section 3.4 and Algorithm 1, SPEC section 10)."""
 
@@ -255,6 +277,7 @@ class Config:
     neck: NeckConfig = field(default_factory=NeckConfig)
     classes: tuple[ClassConfig, ...] = (CAR,)
     head: HeadConfig = field(default_factory=HeadConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
     detection: DetectionConfig = field(default_factory=DetectionConfig)
     data: DataConfig = field(default_factory=DataConfig)
     # Compute type of the network; parameters, BatchNorm, coordinates, IoU and NMS stay float32.

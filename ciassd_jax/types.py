@@ -148,6 +148,30 @@ class Predictions(NamedTuple):
     iou: Float[Array, "*b A"]
 
 
+class Targets(NamedTuple):
+    """What the network should say of every anchor.
+
+    `label` is 1 for a positive anchor, 0 for a negative one, -1 for one that does not count. `truth` is the index of
+    the truth box that a positive anchor is matched to, `box` the residuals to it in the paper's order and `direction`
+    its direction class; the others have -1, zeros and 0 there.
+    """
+
+    label: Int[Array, "*b A"]
+    truth: Int[Array, "*b A"]
+    box: Float[Array, "*b A 7"]
+    direction: Int[Array, "*b A"]
+
+
+class LossTerms(NamedTuple):
+    """The parts of the loss before their weights, and `total`, the weighted sum."""
+
+    classification: Float[Array, "*b"]
+    box: Float[Array, "*b"]
+    direction: Float[Array, "*b"]
+    iou: Float[Array, "*b"]
+    total: Float[Array, "*b"]
+
+
 class Counts(NamedTuple):
     """How much of a scene was used, and how much every fixed capacity had to drop.
 

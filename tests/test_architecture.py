@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "ciassd_jax"
 LAYERS = [
     {"types", "config", "presets"},
     {"ops", "formats"},
-    {"model", "anchors", "detections", "data", "evaluation"},
+    {"model", "anchors", "targets", "losses", "detections", "data", "evaluation"},
     {
         "prediction",
         "weights",
