@@ -35,6 +35,7 @@ pytestmark = pytest.mark.xdist_group("losses")
 
 # Eagerly the overlap alone would compile a hundred programs.
 total_loss = jax.jit(detection_loss, static_argnames="config")
+batch_losses = jax.jit(scene_losses, static_argnames="config")
 one_loss = jax.jit(scene_loss, static_argnames="config")
 find_overlap = jax.jit(detached_overlap)
 
@@ -90,10 +91,14 @@ def golden_batch(folder: Path) -> tuple[dict[str, np.ndarray], Predictions, Targ
 @pytest.mark.reference
 @pytest.mark.parametrize("name", ["all3", "first", "first2", "empty"])
 def test_golden_terms(shared, name):
-    golden, *batch = golden_batch(shared / "golden")
-    predictions, targets = jax.tree.map(lambda leaf: leaf[golden[f"{name}__sample_select"]], batch)
+    """Of the batch in one go, and of batches of some of its scenes: means of their terms."""
+    golden, predictions, targets = golden_batch(shared / "golden")
     anchors, _ = make_anchors(car_released())
-    terms = total_loss(predictions, targets, anchors, CONFIG)
+    if name == "all3":
+        terms = total_loss(predictions, targets, anchors, CONFIG)
+    else:
+        scenes = batch_losses(predictions, targets, anchors, CONFIG)
+        terms = jax.tree.map(lambda term: np.asarray(term)[golden[f"{name}__sample_select"]].mean(), scenes)
     expected = LossTerms(
         golden[f"{name}__cls"],
         golden[f"{name}__box_weighted2"] / 2,
@@ -407,7 +412,7 @@ def test_a_scene_ignores_its_batch_mates_and_the_loss_is_their_mean():
     anchors = some_anchors(50)
     predictions, targets = random_pair(6, (3, 50))
     targets = targets._replace(label=targets.label.at[1].set(0), box=targets.box.at[1].set(0))
-    batch = jax.jit(scene_losses, static_argnames="config")(predictions, targets, anchors, CONFIG)
+    batch = batch_losses(predictions, targets, anchors, CONFIG)
     for index in range(3):
         alone = one_loss(*jax.tree.map(lambda leaf, i=index: leaf[i], (predictions, targets)), anchors, CONFIG)
         np.testing.assert_allclose([term[index] for term in batch], alone, rtol=1e-6)
@@ -425,11 +430,12 @@ def test_half_precision_is_widened_before_anything_is_computed():
     assert {term.dtype for term in terms} == {jnp.dtype("float32")}
     np.testing.assert_allclose(terms, total_loss(wide, targets, anchors, CONFIG), rtol=1e-6)
     positive = targets.label == 1
-    for piece in (
-        classification_loss(half.class_logit, targets.label, **FOCAL),
-        box_loss(half.box, targets.box, positive, sigma=3.0),
-        direction_loss(half.direction, targets.direction, positive),
-        iou_loss(half.iou, jnp.zeros((2, 50)), positive, sigma=3.0),
-        smooth_l1(half.iou, sigma=3.0),
+    for piece, *given in (
+        (lambda z: classification_loss(z, targets.label, **FOCAL), half.class_logit),
+        (lambda box: box_loss(box, targets.box, positive, sigma=3.0), half.box),
+        (lambda box: detached_overlap(box, box, anchors), half.box[0]),
+        (lambda z: direction_loss(z, targets.direction, positive), half.direction),
+        (lambda iou: iou_loss(iou, iou, positive, sigma=3.0), half.iou),
+        (partial(smooth_l1, sigma=3.0), half.iou),
     ):
-        assert piece.dtype == jnp.float32
+        assert jax.eval_shape(piece, *given).dtype == jnp.float32
