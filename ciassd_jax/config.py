@@ -269,6 +269,47 @@ class DetectionConfig:
 
 
 @dataclass(frozen=True)
+class ScheduleConfig:
+    """The optimiser and how long it runs (SPEC section 9): Adam with decoupled decay, norm clipping, one cycle."""
+
+    # 60 epochs of KITTI's 3712 frames in batches of 4.
+    total_steps: int = 55680
+    batch_size: int = 4
+    kind: Literal["one_cycle", "cosine"] = "one_cycle"
+    learning_rate: float = 3e-3
+    # One cycle: the rate starts at 1 / start_divisor of its peak, ends at 1 / end_divisor of that start, and rises for
+    # this share of the steps, while the momentum goes from high to low and back.
+    warmup: float = 0.4
+    start_divisor: float = 10.0
+    end_divisor: float = 1e4
+    momentum: tuple[float, float] = (0.95, 0.85)
+    second_moment: float = 0.99
+    weight_decay: float = 0.01
+    max_gradient_norm: float = 35.0
+    # Gradients of so many batches make one update.
+    accumulate: int = 1
+    # Decay of the running mean of the parameters; 0 for none.
+    ema_decay: float = 0.0
+    # Compute activations again in the backward pass instead of keeping them.
+    rematerialize: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.total_steps, self.batch_size, self.accumulate) < 1:
+            raise ValueError("schedule: total_steps, batch_size and accumulate must be at least 1.")
+        if self.kind not in ("one_cycle", "cosine"):
+            raise ValueError(f"schedule.kind: {self.kind!r} is unknown; choose 'one_cycle' or 'cosine'.")
+        if not (self.learning_rate > 0 and self.start_divisor >= 1 and self.end_divisor >= 1):
+            raise ValueError("schedule: learning_rate must be positive, start_divisor and end_divisor at least 1.")
+        low, high = sorted(self.momentum)
+        if not (0 < self.warmup < 1 and 0 <= low <= high < 1 and 0 <= self.second_moment < 1):
+            raise ValueError("schedule: warmup must lie in (0, 1), momentum and second_moment in [0, 1).")
+        if self.weight_decay < 0 or self.max_gradient_norm <= 0 or not 0 <= self.ema_decay < 1:
+            raise ValueError(
+                "schedule: weight_decay must be at least 0, max_gradient_norm positive, ema_decay in [0, 1)."
+            )
+
+
+@dataclass(frozen=True)
 class Config:
     """A whole detector. The defaults are the paper's (`car()`)."""
 
@@ -280,6 +321,7 @@ class Config:
     loss: LossConfig = field(default_factory=LossConfig)
     detection: DetectionConfig = field(default_factory=DetectionConfig)
     data: DataConfig = field(default_factory=DataConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     # Compute type of the network; parameters, BatchNorm, coordinates, IoU and NMS stay float32.
     dtype: Literal["float32", "bfloat16"] = "float32"
 

@@ -172,6 +172,21 @@ class LossTerms(NamedTuple):
     total: Float[Array, "*b"]
 
 
+class TrainState(NamedTuple):
+    """Everything that a training step changes.
+
+    `ema` is the running mean of the parameters, None where the config asks for none; evaluation and prediction use
+    it when it is there. `skipped` counts updates that were not finite and therefore left out.
+    """
+
+    step: Int[Array, ""]
+    params: Any
+    batch_stats: Any
+    optimizer: Any
+    ema: Any
+    skipped: Int[Array, ""]
+
+
 class Counts(NamedTuple):
     """How much of a scene was used, and how much every fixed capacity had to drop.
 
