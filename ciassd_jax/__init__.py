@@ -7,6 +7,7 @@ from ciassd_jax.detector import Detector
 from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import predict
 from ciassd_jax.presets import car, car_lite, car_released, three_class, tiny
+from ciassd_jax.training import create_train_state, train_step
 from ciassd_jax.types import Boxes, Detections, GroundTruth, PointCloud, Scene
 from ciassd_jax.weights import load_weights, save_weights
 
@@ -23,6 +24,7 @@ __all__ = [
     "car",
     "car_lite",
     "car_released",
+    "create_train_state",
     "init_variables",
     "load_weights",
     "make_batches",
@@ -32,4 +34,5 @@ __all__ = [
     "save_weights",
     "three_class",
     "tiny",
+    "train_step",
 ]

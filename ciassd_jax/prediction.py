@@ -112,7 +112,8 @@ def predict(
 
 
 def variables_of(state_or_variables: Variables) -> Variables:
-    """{"params", "batch_stats"} of a train state, or of a dictionary that holds them."""
+    """{"params", "batch_stats"} of a train state, with the running mean where it has one, or of a dictionary."""
     if isinstance(state_or_variables, dict):
         return {name: state_or_variables[name] for name in ("params", "batch_stats")}
-    return {"params": state_or_variables.params, "batch_stats": state_or_variables.batch_stats}
+    state = state_or_variables
+    return {"params": state.params if state.ema is None else state.ema, "batch_stats": state.batch_stats}

@@ -14,6 +14,7 @@ LAYERS = [
     {"model", "anchors", "targets", "losses", "detections", "data", "evaluation"},
     {
         "prediction",
+        "training",
         "weights",
         "detector",
         "export",
