@@ -14,6 +14,11 @@ LAYERS = [
     {"model", "anchors", "targets", "losses", "detections", "data", "evaluation"},
     {
         "prediction",
+        "checkpoint",
+        "metrics_log",
+        "interruption",
+        "validation",
+        "fitting",
         "training",
         "weights",
         "detector",
@@ -73,8 +78,10 @@ def test_imports_point_down(path: Path) -> None:
                 assert theirs in ("ops", "formats", "types"), f"{relative} knows of {name}"
         if package == "flax":
             assert mine == "model", f"{relative} imports flax"
-        if package in ("grain", "tqdm", "plotly", "matplotlib", "torch", "spconv"):
+        if package in ("grain", "tqdm", "tensorboardX", "plotly", "matplotlib", "torch", "spconv"):
             assert not top, f"{relative} imports {package} at its top"
+        if package == "orbax":
+            assert mine == "checkpoint", f"{relative} imports orbax"
         if package == "tyro":
             assert mine == "cli", f"{relative} imports tyro"
 
@@ -83,7 +90,7 @@ def test_import_is_silent_and_starts_no_device() -> None:
     code = (
         "import ciassd_jax, sys, jax._src.xla_bridge as bridge; "
         "assert not bridge._backends, 'a device was initialised'; "
-        "assert not {'grain', 'tyro', 'tqdm', 'matplotlib', 'torch'} & set(sys.modules)"
+        "assert not {'grain', 'orbax', 'tyro', 'tqdm', 'matplotlib', 'torch'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
