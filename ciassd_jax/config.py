@@ -322,14 +322,15 @@ class Config:
     detection: DetectionConfig = field(default_factory=DetectionConfig)
     data: DataConfig = field(default_factory=DataConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    # Compute type of the network; parameters, BatchNorm, coordinates, IoU and NMS stay float32.
-    dtype: Literal["float32", "bfloat16"] = "float32"
+    # Compute type of the network; parameters, BatchNorm, coordinates, IoU and NMS stay float32. "float64" is for exact
+    # comparisons and needs jax_enable_x64.
+    dtype: Literal["float32", "bfloat16", "float64"] = "float32"
 
     def __post_init__(self) -> None:
         if not self.classes or len({c.name for c in self.classes}) != len(self.classes):
             raise ValueError("classes: at least one is needed, each with its own name.")
-        if self.dtype not in ("float32", "bfloat16"):
-            raise ValueError(f"dtype: {self.dtype!r} is unknown; choose 'float32' or 'bfloat16'.")
+        if self.dtype not in ("float32", "bfloat16", "float64"):
+            raise ValueError(f"dtype: {self.dtype!r} is unknown; choose 'float32', 'bfloat16' or 'float64'.")
         if self.backbone.stages[0].capacity != self.grid.max_voxels:
             raise ValueError(
                 f"backbone: the first stage holds {self.backbone.stages[0].capacity} sites but the grid "

@@ -102,7 +102,7 @@ def train_step(
     if axis_name is not None:
         gradient, terms = lax.pmean((gradient, terms), axis_name)
         batch_stats = lax.pmean(batch_stats, axis_name)
-    norm = optax.global_norm(gradient)
+    norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(norm) & jnp.isfinite(terms.total)
     new_state = _update(state, gradient, batch_stats, finite, config.schedule)
     positives = (targets.label == 1).sum(1).astype(jnp.float32).mean()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ciassd_jax import Config, Detector, init_variables, tiny
+from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
 
 _PROGRAMS: dict[tuple[Config, int], Any] = {}
 _compile = Detector.compile
@@ -72,3 +73,26 @@ def share_programs(monkeypatch: pytest.MonkeyPatch) -> None:
         return _PROGRAMS[key]
 
     monkeypatch.setattr(Detector, "compile", compile_once)
+
+
+def random_scene(config: Config, seed: int) -> Scene:
+    """A labelled scene of `small_cloud` with two cars in the range of `tiny()`, padded to the config's capacities."""
+    rng = np.random.default_rng(seed)
+    points = small_cloud(seed)
+    padded = np.zeros((config.data.max_points, 4), np.float32)
+    padded[: len(points)] = points
+    boxes = np.zeros((config.data.max_boxes, 7), np.float32)
+    boxes[:2, :2] = rng.uniform((2, -5), (11, 5), (2, 2))
+    boxes[:2, 2:] = [-1.0, 3.9, 1.6, 1.5, 0.0]
+    boxes[:2, 6] = rng.uniform(-3, 3, 2)
+    label = np.full(config.data.max_boxes, -1, np.int32)
+    label[:2] = 0
+    zero = np.int32(0)
+    return Scene(
+        PointCloud(padded, np.int32(len(points))),
+        GroundTruth(Boxes.from_array(boxes), label, np.int32(2)),
+        frame=np.int32(seed),
+        points_cut=zero,
+        boxes_cut=zero,
+        objects_cut=zero,
+    )
