@@ -199,3 +199,16 @@ def test_bad_options_are_one_sentence_and_leave_nothing(
 def test_files_take_no_option_of_a_network(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", "--split", "train", "txt", *map(str, folders)]) == 2
     assert capsys.readouterr().err.startswith("error: `ciassd eval txt` compares files, so its only option is --json")
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:
+    """`ciassd eval txt ... | true`: the file is written, and nothing is printed on stderr."""
+    labels, results = tmp_path / "labels", tmp_path / "results"
+    for folder, score in ((labels, ""), (results, " 1.0")):
+        folder.mkdir()
+        row = "Car 0 0 0.1 100 100 200 200 1.5 1.6 3.9 1 1.5 10 0.2"
+        (folder / "000000.txt").write_text(f"{row}{score}\n")
+    command = f"{sys.executable} -m ciassd_jax eval txt {labels} {results} --json {tmp_path / 'ap.json'} | true"
+    done = subprocess.run(["bash", "-o", "pipefail", "-c", command], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "ap.json").is_file()

@@ -38,9 +38,10 @@ class Text:
         with warnings_as_lines(self.results):
             truths, detections = read_folders(self.labels, self.results)
         evaluation = evaluate(truths, detections)
-        print(_text(evaluation))
         if self.json is not None:
             _write(self.json, _json(evaluation))
+        print(_text(evaluation))
+        if self.json is not None:
             print(f"Wrote {self.json}.")
         return 0
 
