@@ -12,9 +12,9 @@ import optax
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
-from ciassd_jax.config import LossConfig
 from ciassd_jax.ops import boxes as box_ops
 from ciassd_jax.ops.iou import iou_3d
+from ciassd_jax.training_config import LossConfig
 from ciassd_jax.types import Array, Boxes, LossTerms, Predictions, Targets
 
 

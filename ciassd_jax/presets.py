@@ -10,13 +10,13 @@ from ciassd_jax.config import (
     BackboneConfig,
     ClassConfig,
     Config,
-    DataConfig,
     DetectionConfig,
     GridConfig,
     HeadConfig,
     NeckConfig,
     StageConfig,
 )
+from ciassd_jax.training_config import DataConfig
 
 
 def car() -> Config:

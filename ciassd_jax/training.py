@@ -15,11 +15,12 @@ import optax
 from jax import lax
 
 from ciassd_jax.anchors import make_anchors
-from ciassd_jax.config import Config, ScheduleConfig
+from ciassd_jax.config import Config
 from ciassd_jax.losses import detection_loss
 from ciassd_jax.model.detector import CIASSD, init_variables
 from ciassd_jax.prediction import voxelize_batch
 from ciassd_jax.targets import assign_targets
+from ciassd_jax.training_config import ScheduleConfig
 from ciassd_jax.types import Array, LossTerms, Scene, Targets, TrainState, Variables
 
 

@@ -16,11 +16,11 @@ from ciassd_jax.config import (
     DetectionConfig,
     GridConfig,
     HeadConfig,
-    LossConfig,
     NeckConfig,
     StageConfig,
 )
 from ciassd_jax.presets import PRESETS, car, car_lite, car_released, three_class, tiny
+from ciassd_jax.training_config import LossConfig
 
 presets = pytest.mark.parametrize("make", list(PRESETS.values()), ids=list(PRESETS))
 

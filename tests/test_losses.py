@@ -12,7 +12,6 @@ from jax.test_util import check_grads
 from oracles_training import focal_by_hand, smooth_l1_by_hand
 
 from ciassd_jax.anchors import make_anchors
-from ciassd_jax.config import LossConfig
 from ciassd_jax.losses import (
     box_loss,
     classification_loss,
@@ -28,6 +27,7 @@ from ciassd_jax.ops.boxes import decode, encode
 from ciassd_jax.ops.iou import iou_3d
 from ciassd_jax.presets import car_released, tiny
 from ciassd_jax.targets import assign_targets
+from ciassd_jax.training_config import LossConfig
 from ciassd_jax.types import Boxes, GroundTruth, LossTerms, Predictions, Targets
 
 # One worker, so that nothing is compiled twice.

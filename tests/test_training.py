@@ -19,9 +19,9 @@ import pytest
 from small import random_scene, random_variables, small_config
 
 from ciassd_jax import Config, car, create_train_state, train_step
-from ciassd_jax.config import ScheduleConfig
 from ciassd_jax.prediction import variables_of
 from ciassd_jax.training import learning_rate, make_optimizer, momentum
+from ciassd_jax.training_config import ScheduleConfig
 from ciassd_jax.types import Scene
 
 pytestmark = pytest.mark.xdist_group("training")

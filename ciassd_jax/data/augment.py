@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Bool, Float
 
-from ciassd_jax.config import AugmentationConfig, Config
+from ciassd_jax.config import Config
 from ciassd_jax.ops.footprints import footprint_corners, footprints_collide, points_in_boxes
+from ciassd_jax.training_config import AugmentationConfig
 from ciassd_jax.types import Array, Boxes, GroundTruth, PasteObjects, PointCloud, Scene
 
 

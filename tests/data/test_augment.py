@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles_data import accept_by_loop, box_coordinates, footprint, inside, move_by_loop
 
-from ciassd_jax.config import AugmentationConfig, ClassConfig
+from ciassd_jax.config import ClassConfig
 from ciassd_jax.data.augment import (
     accept_objects,
     add_object_noise,
@@ -28,6 +28,7 @@ from ciassd_jax.data.augment import (
 )
 from ciassd_jax.ops.boxes import to_paper
 from ciassd_jax.presets import tiny
+from ciassd_jax.training_config import AugmentationConfig
 from ciassd_jax.types import Boxes, GroundTruth, PasteObjects, PointCloud, Scene
 
 POINTS, BOXES, PASTE_POINTS = 512, 16, 256

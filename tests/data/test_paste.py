@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from oracles_data import footprint, inside
 
-from ciassd_jax.config import AugmentationConfig, ClassConfig
+from ciassd_jax.config import ClassConfig
 from ciassd_jax.data.augment import augment, scene_key
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import Dataset, Frame
@@ -24,6 +24,7 @@ from ciassd_jax.data.paste import (
 from ciassd_jax.data.scenes import pad_frame
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.presets import car, tiny
+from ciassd_jax.training_config import AugmentationConfig
 from ciassd_jax.types import Boxes
 
 NAMES = ("Car", "Car", "Van", "Cyclist")

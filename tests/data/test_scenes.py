@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ciassd_jax import Config, three_class, tiny
-from ciassd_jax.config import AugmentationConfig
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.data.scenes import pad_frame, target_labels
 from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.training_config import AugmentationConfig
 from ciassd_jax.types import Boxes
 
 TYPES = ("Van", "Car", "Truck", "Pedestrian", "Car")
