@@ -186,7 +186,7 @@ def edited(path: str, value: object) -> str:
         ("classes", {}, r"config\.classes: expected a list, not \{\}"),
         ("classes.0.name", 5, r"config\.classes\[0\]\.name: expected str, not 5"),
         ("backbone.stages.1.layers", "two", r"config\.backbone\.stages\[1\]\.layers: expected int, not 'two'"),
-        ("dtype", "float64", r"config\.dtype: 'float64' is not one of \['float32', 'bfloat16'\]"),
+        ("dtype", "float16", r"config\.dtype: 'float16' is not one of \['float32', 'bfloat16', 'float64'\]"),
         ("detection.nms", ["paper"], r"config\.detection\.nms: \['paper'\] is not one of"),
         # Equal to 1 and to 3 in Python, but no kernel sizes.
         ("neck.attention_kernel", True, r"config\.neck\.attention_kernel: True is not one of \[1, 3\]"),
@@ -273,7 +273,7 @@ def no_type_checks():
         (DetectionConfig, {"sigma_distances": (20.0, 60.0, 40.0)}, "detection: .*sigma_distances ascending"),
         (Config, {"classes": ()}, "classes: at least one is needed"),
         (Config, {"classes": (ClassConfig(), ClassConfig())}, "classes: .*each with its own name"),
-        (Config, {"dtype": "float16"}, "dtype: 'float16' is unknown; choose 'float32' or 'bfloat16'"),
+        (Config, {"dtype": "float16"}, "dtype: 'float16' is unknown; choose 'float32', 'bfloat16' or 'float64'"),
         (Config, {"grid": GridConfig(max_voxels=100)}, "backbone: the first stage holds 20000 .* the grid 100 voxels"),
         (Config, {"grid": GridConfig(maximum=(70.0, 40.0, 1.0))}, r"grid\.x: 1400 voxels .* 1392 or 1408\."),
         (Config, {"grid": GridConfig(maximum=(70.4, 39.8, 1.0))}, r"grid\.y: 1596 voxels .* 1584 or 1600\."),
