@@ -41,7 +41,7 @@ class Checkpoints:
         if keep < 1:
             raise ValueError(f"{keep} checkpoints to keep are too few; keep at least 1.")
         check_folder(folder)
-        self._folder, self._config = Path(folder).absolute(), config
+        self.folder, self._config = Path(folder).absolute(), config
         best = BestN(get_metric_fn=lambda metrics: metrics["score"], n=1, keep_checkpoints_without_metrics=False)
         options = ocp.CheckpointManagerOptions(
             preservation_policy=AnyPreservationPolicy([LatestN(keep), best]),
@@ -49,7 +49,7 @@ class Checkpoints:
             cleanup_tmp_directories=True,
         )
         self._manager = ocp.CheckpointManager(
-            self._folder, options=options, item_names=("state", "progress"), item_handlers=_handlers()
+            self.folder, options=options, item_names=("state", "progress"), item_handlers=_handlers()
         )
 
     @property
@@ -88,7 +88,7 @@ class Checkpoints:
         for step in reversed(self.steps):
             try:
                 progress = self._read(step, progress=ocp.args.JsonRestore())["progress"]
-                _check_config(progress["config"], self._config, self._folder / str(step))
+                _check_config(progress["config"], self._config, self.folder / str(step))
                 state = self._read(step, state=ocp.args.StandardRestore(_abstract(like)))["state"]
             except FormatError:
                 raise
@@ -100,7 +100,7 @@ class Checkpoints:
             return Checkpoint(state, LoaderState(**progress["loader"]), progress["score"])
         if damaged:
             raise FormatError(
-                f"None of the checkpoints in {self._folder} can be read; start anew in another folder, from "
+                f"None of the checkpoints in {self.folder} can be read; start anew in another folder, from "
                 "last.safetensors beside it if you like."
             )
         return None
@@ -128,16 +128,16 @@ class Checkpoints:
 
     def _remove(self, steps: list[int]) -> None:
         for step in steps:
-            text = f"{self._folder / str(step)} is damaged; it was removed, and training goes on from the one before."
+            text = f"{self.folder / str(step)} is damaged; it was removed, and training goes on from the one before."
             warnings.warn(text, FormatWarning, stacklevel=3)
-            shutil.rmtree(self._folder / str(step))
+            shutil.rmtree(self.folder / str(step))
         if steps:
             self._manager.reload()
 
     def _refused(self, error: Exception) -> FormatError:
         reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         return FormatError(
-            f"A checkpoint cannot be written to {self._folder} ({reason[:200]}); free some space or mend its "
+            f"A checkpoint cannot be written to {self.folder} ({reason[:200]}); free some space or mend its "
             "permissions, then run again: the earlier ones are intact."
         )
 

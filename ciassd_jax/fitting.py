@@ -21,13 +21,14 @@ import jax
 
 from ciassd_jax.checkpoint import Checkpoints
 from ciassd_jax.config import Config
-from ciassd_jax.data.batching import Batches, WorkerError, make_batches
+from ciassd_jax.data.batching import Batches, WorkerError
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.paste import PasteDatabase, build_database, fingerprint_of, open_database
 from ciassd_jax.formats.errors import FormatError, Pathlike
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.interruption import signals_noted
 from ciassd_jax.metrics_log import MetricsLog, is_left_out, summarise
+from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import variables_of
 from ciassd_jax.scoring import TRAINED
 from ciassd_jax.training import create_train_state, train_step
@@ -71,51 +72,38 @@ class Intervals:
 
 def fit(
     config: Config,
-    dataset: Dataset,
+    batches: Batches,
     workdir: Pathlike,
     *,
     validation: Dataset | None = None,
-    database: PasteDatabase | None = None,
-    augmented: bool = True,
     variables: Variables | None = None,
-    seed: int = 0,
-    workers: int = 0,
     intervals: Intervals | None = None,
     progress: bool = False,
     say: Callable[[str], object] = print,
 ) -> Fitted:
-    """Train for `config.schedule.total_steps`, from the newest checkpoint in `workdir` where there is one.
+    """Train for `config.schedule.total_steps` on `make_batches`, from the newest checkpoint in `workdir` where one is.
 
     A run that was stopped, killed or broke, and is called again in the same way, ends with the same bits as one that
-    was not. `variables` are those to start from. SIGTERM and Ctrl-C end it after the step with everything saved.
+    was not. Without `variables` to start from they are drawn from the seed of the batches. SIGTERM and Ctrl-C end it
+    after the step, with everything saved. The batches are closed at the end.
 
-    Raises FormatError for a frame, checkpoint or folder that cannot be used, WorkerError for a dead worker,
-    TrainingError where losses stay not finite, ValueError for numbers that fit no training. Checkpoints stay intact.
+    Raises FormatError for a frame, checkpoint or folder that cannot be used, WorkerError for a dead worker, and
+    TrainingError where losses stay not finite; checkpoints stay intact.
     """
-    intervals, folder, schedule = intervals or Intervals(), Path(workdir), config.schedule
+    intervals, folder = intervals or Intervals(), Path(workdir)
     check_folder(folder)
-    create = partial(create_train_state, jax.random.key(seed), config, variables=variables)
     with ExitStack() as stack:
+        stack.enter_context(batches)
         stopped = stack.enter_context(signals_noted())
-        batches = stack.enter_context(
-            make_batches(
-                dataset,
-                config,
-                seed=seed,
-                batch_size=schedule.batch_size,
-                database=database,
-                augmented=augmented,
-                workers=workers,
-            )
-        )
         checkpoints = stack.enter_context(Checkpoints(folder / "checkpoints", config, keep=intervals.keep))
-        state = _resume(checkpoints, batches, create, folder, say)
-        _describe(folder, config, seed)
+        state = _resume(checkpoints, batches, config, say)
+        if state is None:
+            state = create_train_state(jax.random.key(batches.state.seed), config, variables=variables)
+        _describe(folder, config, batches)
         log = MetricsLog(folder, int(state.step), say)
         stack.callback(log.close)
         scored = Validation(validation, config) if validation is not None else None
-        run = _Run(config, folder, len(dataset), scored, intervals, checkpoints, batches, log, say, state)
-        run.skipped = int(state.skipped)
+        run = _Run(config, folder, scored, intervals, checkpoints, batches, log, say, state, int(state.skipped))
         run.train(stopped, progress)
     return Fitted(run.state, run.best, stopped[0] if stopped else None)
 
@@ -126,7 +114,6 @@ class _Run:
 
     config: Config
     folder: Path
-    frames: int
     validation: Validation | None
     intervals: Intervals
     checkpoints: Checkpoints
@@ -134,8 +121,8 @@ class _Run:
     log: MetricsLog
     say: Callable[[str], object]
     state: TrainState
+    skipped: int
     pending: list[dict[str, Any]] = field(default_factory=list)
-    skipped: int = 0
     since: float = field(default_factory=time.perf_counter)
 
     @property
@@ -209,7 +196,7 @@ class _Run:
         skipped, self.skipped = int(rows[-1]["skipped"]) - self.skipped, int(rows[-1]["skipped"])
         numbers = summarise(rows)
         seconds = (time.perf_counter() - self.since) / len(rows)
-        numbers |= {"epoch": step * self.config.schedule.batch_size / self.frames, "seconds": seconds}
+        numbers |= {"epoch": self._epoch(step), "seconds": seconds}
         self.log.write(step, numbers)
         self.pending, self.since = [], time.perf_counter()
         lost = ", ".join(f"{name} {numbers[name]:.0f}" for name in numbers if is_left_out(name) and numbers[name])
@@ -223,13 +210,17 @@ class _Run:
                 "start anew in another folder."
             )
 
+    def _epoch(self, step: int) -> float:
+        """How often the frames were seen after so many steps."""
+        return step * self.batches.state.batch_size / self.batches.state.frames
+
     def _is_evaluated(self, step: int) -> bool:
         """Whether an epoch that is to be evaluated ended with this step, or training does."""
-        every = self.intervals.evaluate * self.frames
+        every = self.intervals.evaluate
         if self.validation is None or every == 0:
             return False
-        size = self.config.schedule.batch_size
-        return step == self.config.schedule.total_steps or step * size // every > (step - 1) * size // every
+        ended = self._epoch(step) // every > self._epoch(step - 1) // every
+        return ended or step == self.config.schedule.total_steps
 
     def _evaluate(self, step: int) -> float | None:
         """Score the validation frames, and keep the weights if they are the best so far."""
@@ -257,37 +248,32 @@ class _Run:
 
 
 def _resume(
-    checkpoints: Checkpoints,
-    batches: Batches,
-    create: Callable[[], TrainState],
-    folder: Path,
-    say: Callable[[str], object],
-) -> TrainState:
-    """The state to go on from, with the loader there too; a fresh one without a checkpoint."""
-    if not checkpoints.steps:
-        return create()
-    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    like = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), jax.eval_shape(create)
-    )
+    checkpoints: Checkpoints, batches: Batches, config: Config, say: Callable[[str], object]
+) -> TrainState | None:
+    """The state to go on from, with the loader there too; None without a checkpoint."""
+    key, here = jax.random.key(0), jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    variables = jax.eval_shape(partial(init_variables, config=config), key)
+    shapes = jax.eval_shape(lambda start: create_train_state(key, config, variables=start), variables)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
     restored = checkpoints.restore(like)
-    assert restored is not None
+    if restored is None:
+        return None
     try:
         batches.set_state(restored.loader)
     except ValueError as error:
-        raise FormatError(f"{folder} is of another training: {error}") from error
-    say(f"Going on from step {int(restored.state.step)} in {folder}.")
+        raise FormatError(f"{checkpoints.folder} is of another training: {error}") from error
+    say(f"Going on from step {int(restored.state.step)} in {checkpoints.folder}.")
     return restored.state
 
 
-def _describe(folder: Path, config: Config, seed: int) -> None:
+def _describe(folder: Path, config: Config, batches: Batches) -> None:
     """Write the config, and what the training ran with."""
     packages = ("ciassd_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy")
     facts = {
         **{name: version(name) for name in packages},
         "python": platform.python_version(),
         "devices": [f"{device.platform} {device.device_kind}" for device in jax.devices()],
-        "seed": seed,
+        **{name: value for name, value in batches.state._asdict().items() if name != "batch"},
     }
     write_text(folder / "config.json", config.to_json())
     write_text(folder / "versions.json", json.dumps(facts, indent=1))

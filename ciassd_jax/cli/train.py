@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -10,12 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from ciassd_jax.cli.inference import Preset
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
 from ciassd_jax.config import Config
-from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.presets import PRESETS
 
 if TYPE_CHECKING:
+    from ciassd_jax.data.batching import Batches
     from ciassd_jax.data.frames import Dataset
     from ciassd_jax.data.paste import PasteDatabase
+    from ciassd_jax.fitting import Intervals
     from ciassd_jax.types import Variables
 
 Item = TypeVar("Item")
@@ -94,14 +96,12 @@ class Train:
         with warnings_as_lines(root):
             try:
                 return self._train(root, tqdm.write)
-            except FormatError:
-                raise
-            except (ValueError, WorkerError, TrainingError) as error:
+            except (WorkerError, TrainingError) as error:
                 raise UsageError(str(error)) from error
 
     def _train(self, root: Path, say: Any) -> int:
         from ciassd_jax.data.folders import open_dataset
-        from ciassd_jax.fitting import Intervals, fit
+        from ciassd_jax.fitting import fit
 
         dataset = open_dataset(root, self.split, self.image_size)
         validation = None
@@ -109,18 +109,16 @@ class Train:
             dataset = validation = self._one_frame(dataset, self.overfit_one)
         elif self.validate is not None and self.evaluate_every:
             validation = open_dataset(root, self.validate, self.image_size)
-        config = self._config(len(dataset))
+        config, intervals = self._config(len(dataset)), self._intervals()
+        variables = self._variables(config)
+        batches = self._batches(dataset, config, self._database(dataset, config, root, say))
         fitted = fit(
             config,
-            dataset,
+            batches,
             self.workdir,
             validation=validation,
-            database=self._database(dataset, config, root, say),
-            augmented=self.overfit_one is None,
-            variables=self._variables(config),
-            seed=self.seed,
-            workers=self.workers,
-            intervals=Intervals(self.log_every, self.save_every, self.evaluate_every, self.keep),
+            variables=variables,
+            intervals=intervals,
             progress=True,
             say=say,
         )
@@ -133,17 +131,39 @@ class Train:
         return 0 if self.overfit_one is None else self._report_overfit(fitted.state, dataset, config, say)
 
     def _config(self, frames: int) -> Config:
-        """The preset with the options' values; ValueError for those that it refuses."""
+        """The preset with the options' values."""
         if self.steps is not None and self.epochs is not None:
             raise UsageError("Give either --steps or --epochs.")
-        config, one = PRESETS[self.preset](), self.overfit_one is not None
+        config = PRESETS[self.preset]()
         given = {name: getattr(self, name) for name in _SCHEDULE if getattr(self, name) is not None}
-        defaults = {"total_steps": _OVERFIT_STEPS, "batch_size": 1} if one else {}
-        schedule = replace(config.schedule, **(defaults | given))
-        steps = self.steps if self.epochs is None else max(self.epochs * frames // schedule.batch_size, 1)
-        if steps is not None:
-            schedule = replace(schedule, total_steps=steps)
+        if self.overfit_one is not None:
+            given = {"total_steps": _OVERFIT_STEPS, "batch_size": 1} | given
+        with _refused_as_usage():
+            schedule = replace(config.schedule, **given)
+            steps = self.steps if self.epochs is None else self.epochs * frames // schedule.batch_size
+            if steps is not None:
+                schedule = replace(schedule, total_steps=steps)
         return replace(config, schedule=schedule, dtype=self.dtype or config.dtype)
+
+    def _intervals(self) -> Intervals:
+        from ciassd_jax.fitting import Intervals
+
+        with _refused_as_usage():
+            return Intervals(self.log_every, self.save_every, self.evaluate_every, self.keep)
+
+    def _batches(self, dataset: Dataset, config: Config, database: PasteDatabase | None) -> Batches:
+        from ciassd_jax.data.batching import make_batches
+
+        with _refused_as_usage():
+            return make_batches(
+                dataset,
+                config,
+                seed=self.seed,
+                batch_size=config.schedule.batch_size,
+                database=database,
+                augmented=self.overfit_one is None,
+                workers=self.workers,
+            )
 
     def _one_frame(self, dataset: Dataset, name: str) -> Dataset:
         if name not in dataset.names:
@@ -180,6 +200,15 @@ class Train:
         found, targets = count_found(state, dataset, config)
         say(f"Frame {self.overfit_one}: {found} of {targets} objects are found at a 3D overlap of 0.7.")
         return 0 if found == targets else 1
+
+
+@contextmanager
+def _refused_as_usage() -> Iterator[None]:
+    """What these numbers are refused with is the user's to mend."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 def _progress(items: Sequence[Item]) -> Iterable[Item]:
