@@ -29,8 +29,6 @@ from ciassd_jax.formats.kitti import read_rows
 from ciassd_jax.formats.points import write_bin
 from ciassd_jax.presets import PRESETS
 
-pytestmark = pytest.mark.xdist_group("detector")
-
 
 class Run(NamedTuple):
     code: int

@@ -17,8 +17,6 @@ from ciassd_jax.cli import main
 from ciassd_jax.evaluation import evaluate, read_folders, to_json
 from ciassd_jax.formats.kitti import ObjectRow, write_rows
 
-pytestmark = pytest.mark.xdist_group("detector")
-
 
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path]:

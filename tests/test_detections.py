@@ -19,7 +19,6 @@ from ciassd_jax.presets import car, car_released, three_class
 from ciassd_jax.types import Boxes, Candidates, Predictions
 
 # One worker, so that nothing is compiled twice.
-pytestmark = pytest.mark.xdist_group("detections")
 
 # The golden README's tolerances.
 BOXES, SCORES = 1e-3, 1e-5

@@ -17,8 +17,6 @@ from ciassd_jax.detector import DroppedWarning, FrameResult
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.types import Counts
 
-pytestmark = pytest.mark.xdist_group("detector")
-
 
 @pytest.fixture
 def detector(monkeypatch: pytest.MonkeyPatch) -> Detector:

@@ -27,7 +27,6 @@ from ciassd_jax.metrics_log import MetricsLog
 from ciassd_jax.prediction import variables_of
 from ciassd_jax.types import TrainState
 
-pytestmark = pytest.mark.xdist_group("fitting")
 _PROGRAMS: dict[Any, Any] = {}
 _compile = fitting._Run._compile
 

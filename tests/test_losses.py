@@ -31,7 +31,6 @@ from ciassd_jax.training_config import LossConfig
 from ciassd_jax.types import Boxes, GroundTruth, LossTerms, Predictions, Targets
 
 # One worker, so that nothing is compiled twice.
-pytestmark = pytest.mark.xdist_group("losses")
 
 # Eagerly the overlap alone would compile a hundred programs.
 total_loss = jax.jit(detection_loss, static_argnames="config")

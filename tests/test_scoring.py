@@ -22,7 +22,6 @@ from ciassd_jax.formats.kitti import parse_row
 from ciassd_jax.formats.points import read_points, write_bin
 from ciassd_jax.scoring import detect_dataset, find_trained, score_dataset, score_frames, write_frames
 
-pytestmark = pytest.mark.xdist_group("detector")
 Detect = Callable[[np.ndarray], tuple[np.ndarray, tuple[str, ...]]]
 # Four decimals of metres and pixels move an overlap past its limit, or join two scores, only now and then.
 ROUNDING = 0.05

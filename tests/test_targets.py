@@ -19,7 +19,6 @@ from ciassd_jax.targets import assign_targets, nearest_iou
 from ciassd_jax.types import Boxes, GroundTruth, Targets
 
 # One worker, so that nothing is compiled twice.
-pytestmark = pytest.mark.xdist_group("targets")
 
 # Two classes on a grid of numbers that float32 holds exactly, so that ties are ties in any arithmetic.
 SMALL = replace(

@@ -24,7 +24,6 @@ from ciassd_jax.training import learning_rate, make_optimizer, momentum
 from ciassd_jax.training_config import ScheduleConfig
 from ciassd_jax.types import Scene
 
-pytestmark = pytest.mark.xdist_group("training")
 step = jax.jit(train_step, static_argnames=("config", "axis_name"))
 
 

@@ -41,7 +41,7 @@ LAYERS = {
 }
 OUT_WINDOW = {"kernel": (3, 1, 1), "stride": (2, 1, 1), "padding": (0, 0, 0)}
 FRAMES = ("000010", "000068", "000095")
-pytestmark = [pytest.mark.reference, pytest.mark.xdist_group("golden_network")]
+pytestmark = pytest.mark.reference
 
 
 @cache

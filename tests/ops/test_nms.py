@@ -29,7 +29,6 @@ from ciassd_jax.ops.nms import (
 from ciassd_jax.types import Boxes, Candidates
 
 # One worker, so that nothing is compiled twice.
-pytestmark = pytest.mark.xdist_group("nms")
 
 SETTINGS = {"overlap": 0.3, "sigma_squared": (0.0009, 0.009, 0.1, 1.0), "distances": (20.0, 40.0, 60.0)}
 SLOTS = 64
