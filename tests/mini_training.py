@@ -18,7 +18,7 @@ INTERVALS = Intervals(log=1, save=2, evaluate=4, keep=2)
 
 
 def mini_config(steps: int = STEPS) -> Config:
-    """Without the second stage's capacity and most of the anchors' classes nothing is lost: it compiles sooner."""
+    """`small_config()` with a running mean of the weights, so that every part of a state is there."""
     config = small_config()
     return replace(
         config,
