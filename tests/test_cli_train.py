@@ -19,7 +19,6 @@ from ciassd_jax.fitting import Fitted
 from ciassd_jax.presets import PRESETS
 
 # One program of training and one of evaluation serve the whole file.
-pytestmark = pytest.mark.xdist_group("cli_train")
 _PROGRAMS: dict[Any, Any] = {}
 _compile = fitting._Run._compile
 
