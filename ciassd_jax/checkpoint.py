@@ -6,6 +6,8 @@ A checkpoint appears whole or not at all, written while training goes on. The la
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
 import warnings
 from pathlib import Path
@@ -135,11 +137,20 @@ class Checkpoints:
             self._manager.reload()
 
     def _refused(self, error: Exception) -> FormatError:
-        reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         return FormatError(
-            f"A checkpoint cannot be written to {self.folder} ({reason[:200]}); free some space or mend its "
+            f"A checkpoint cannot be written to {self.folder} ({_reason(error)}); free some space or mend its "
             "permissions, then run again: the earlier ones are intact."
         )
+
+
+def _reason(error: Exception) -> str:
+    """The operating system's words where it is known that they are its; else the beginning of the error's."""
+    code = error.errno if isinstance(error, OSError) else None
+    if found := re.search(r"os_error_code='(\d+)'", str(error)):
+        code = int(found[1])
+    if code is not None:
+        return os.strerror(code)
+    return next((line[:200] for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
 def _handlers() -> dict[str, Any]:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import logging
+import sys
+import time
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from ciassd_jax.cli.inference import Preset
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
 from ciassd_jax.config import Config
+from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.presets import PRESETS
 
 if TYPE_CHECKING:
@@ -93,7 +99,7 @@ class Train:
 
         root = find_root(self.data)
         check_folder(self.workdir)
-        with warnings_as_lines(root):
+        with warnings_as_lines(root), _storage_silenced():
             try:
                 return self._train(root, tqdm.write)
             except (WorkerError, TrainingError) as error:
@@ -200,6 +206,30 @@ class Train:
         found, targets = count_found(state, dataset, config)
         say(f"Frame {self.overfit_one}: {found} of {targets} objects are found at a 3D overlap of 0.7.")
         return 0 if found == targets else 1
+
+
+@contextmanager
+def _storage_silenced() -> Iterator[None]:
+    """Of a file that cannot be read or written the storage's threads print pages, when our sentence says it."""
+    for name in ("absl", "asyncio"):
+        # For good: some of it is said when the program ends.
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    before = sys.unraisablehook
+    sys.unraisablehook = lambda unraisable: None
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+            try:
+                yield
+            except FormatError as error:
+                # Writes that were given up end a little later; causes and frames would keep them until the very end.
+                time.sleep(0.5)
+                error.__cause__ = error.__context__ = None
+                raise error.with_traceback(None)  # noqa: B904
+            finally:
+                gc.collect()
+    finally:
+        sys.unraisablehook = before
 
 
 @contextmanager
