@@ -6,14 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
 from mini_folders import NAMES, write_kitti, write_split
 from small import random_variables, small_config
 
-from ciassd_jax import Config, make_batches, open_dataset
+from ciassd_jax import Config, fitting, make_batches, open_dataset
 from ciassd_jax.data.batching import Batches
 from ciassd_jax.fitting import Fitted, Intervals, find_database, fit
 
 STEPS = 9
+_PROGRAMS: dict[Any, Any] = {}
+_compile = fitting._Run._compile
 INTERVALS = Intervals(log=1, save=2, evaluate=4, keep=2)
 
 
@@ -46,6 +49,18 @@ def mini_fit(root: Path, workdir: Path, say: Callable[[str], object] = lambda te
     chosen = {"variables": random_variables(config), "intervals": INTERVALS, "say": say} | options
     batches = chosen.pop("batches", None) or mini_batches(root, config)
     return fit(config, batches, workdir, **chosen)
+
+
+def share_training_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile the step of a config once for all trainings of this process."""
+
+    def compile_once(self: Any, batch: Any) -> Any:
+        key = self.config, len(batch.frame)
+        if key not in _PROGRAMS:
+            _PROGRAMS[key] = _compile(self, batch)
+        return _PROGRAMS[key]
+
+    monkeypatch.setattr(fitting._Run, "_compile", compile_once)
 
 
 if __name__ == "__main__":

@@ -2,17 +2,16 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import pytest
-from mini_training import mini_config, write_data
+from mini_training import STEPS, mini_config, share_training_programs, write_data
 from small import random_variables
 
-from ciassd_jax import fitting, load_weights, save_weights
+from ciassd_jax import create_train_state, fitting, load_weights, save_weights
 from ciassd_jax.cli import main
 from ciassd_jax.data.folders import database_path
 from ciassd_jax.fitting import Fitted
@@ -36,21 +35,15 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
-    """Train the small network in place of `tiny`, four steps of one scene unless said otherwise, unscored."""
-
-    def compile_once(self: Any, batch: Any) -> Any:
-        key = replace(self.config, schedule=replace(self.config.schedule, total_steps=1)), len(batch.frame)
-        if key not in _PROGRAMS:
-            _PROGRAMS[key] = _compile(self, batch)
-        return _PROGRAMS[key]
+    """Train the small network in place of `tiny`, in the program of `mini_fit` unless said otherwise, unscored."""
 
     def call(*arguments: object, **options: object) -> Run:
-        chosen = {"preset": "tiny", "data": root, "batch-size": 1, "steps": 4, "evaluate-every": 0} | options
+        chosen = {"preset": "tiny", "data": root, "batch-size": 2, "steps": STEPS, "evaluate-every": 0} | options
         given = [text for name, value in chosen.items() if value is not None for text in (f"--{name}", str(value))]
         code = main(["train", *given, *map(str, arguments)])
         return Run(code, *capsys.readouterr())
 
-    monkeypatch.setattr(fitting._Run, "_compile", compile_once)
+    share_training_programs(monkeypatch)
     monkeypatch.setitem(PRESETS, "tiny", mini_config)
     return call
 
@@ -64,12 +57,12 @@ def test_trains_and_goes_on(run: Callable[..., Run], root: Path, tmp_path: Path)
     assert first.code == 0, first.err
     assert f"Collecting the objects to paste from 3 frames into {tmp_path}" in first.out
     assert not database_path(root, "train").exists()
-    assert f"Trained 4 steps. Weights, metrics and evaluations are in {tmp_path}." in first.out
-    assert steps_of(tmp_path) == [2, 4]
+    assert f"Trained 9 steps. Weights, metrics and evaluations are in {tmp_path}." in first.out
+    assert steps_of(tmp_path) == [2, 4, 6, 8, 9]
     saved = load_weights(tmp_path / "last.safetensors").variables
     again = run(workdir=tmp_path, **{"log-every": 2})
     assert again.code == 0
-    assert "Going on from step 4 in " in again.out
+    assert "Going on from step 9 in " in again.out
     assert "Collecting" not in again.out
     jax.tree.map(np.testing.assert_array_equal, load_weights(tmp_path / "last.safetensors").variables, saved)
 
@@ -89,36 +82,46 @@ def test_another_config_or_seed_is_one_sentence(run: Callable[..., Run], tmp_pat
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_starts_from_weights(run: Callable[..., Run], tmp_path: Path) -> None:
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """What `fit` is called with; it trains nothing."""
+    calls: list[tuple[Any, ...]] = []
+
+    def stand_in(config: Any, batches: Any, workdir: Path, **options: Any) -> Fitted:
+        calls.append((config, batches._rows.stream, options))
+        variables = random_variables(config)
+        return Fitted(create_train_state(jax.random.key(0), config, variables=variables), None, None)
+
+    monkeypatch.setattr(fitting, "fit", stand_in)
+    return calls
+
+
+def test_starts_from_weights(run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path) -> None:
     start = tmp_path / "start.safetensors"
-    save_weights(start, random_variables(mini_config()), mini_config())
-    done = run(workdir=tmp_path / "w", steps=1, **{"init-from": start})
-    assert done.code == 0, done.err
-    trained = load_weights(tmp_path / "w" / "last.safetensors").variables["params"]["head"]["box"]["kernel"]
-    given = random_variables(mini_config())["params"]["head"]["box"]["kernel"]
-    # The first update moves no weight by more than about a tenth of the peak rate of 0.003.
-    assert 0 < abs(trained - given).max() < 5e-4
+    save_weights(start, random_variables(mini_config(), seed=5), mini_config())
+    assert run(workdir=tmp_path / "w", **{"init-from": start}).code == 0
+    ((_, _, options),) = fits
+    jax.tree.map(np.testing.assert_array_equal, options["variables"], random_variables(mini_config(), seed=5))
 
 
 def test_overfit_one_takes_that_frame_alone_and_reports(
-    run: Callable[..., Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path
 ) -> None:
-    taken = []
-
-    def stand_in(config: Any, batches: Any, workdir: Path, **options: Any) -> Fitted:
-        stream = batches._rows.stream
-        taken.append((stream.dataset.names, stream.augmented, options["validation"].names, config.schedule))
-        return Fitted(
-            fitting.create_train_state(jax.random.key(0), config, variables=random_variables(config)), None, None
-        )
-
-    monkeypatch.setattr(fitting, "fit", stand_in)
     done = run("--overfit-one", "000001", workdir=tmp_path, steps=None, **{"batch-size": None})
     assert done.code == 1, done.err
     assert "Frame 000001: 0 of 2 objects are found at a 3D overlap of 0.7." in done.out
-    ((names, augmented, validated, schedule),) = taken
-    assert (names, augmented, validated) == (("000001",), False, ("000001",))
-    assert (schedule.total_steps, schedule.batch_size) == (500, 1)
+    ((config, stream, options),) = fits
+    assert (stream.dataset.names, stream.augmented, stream.database) == (("000001",), False, None)
+    assert options["validation"].names == ("000001",)
+    assert (config.schedule.total_steps, config.schedule.batch_size) == (500, 1)
+
+
+def test_options_go_to_the_config(run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path) -> None:
+    options = {"epochs": 6, "steps": None, "kind": "cosine", "dtype": "bfloat16", "seed": 4}
+    assert run(workdir=tmp_path, **options).code == 0
+    ((config, stream, _),) = fits
+    assert (config.schedule.total_steps, config.schedule.kind, config.dtype) == (9, "cosine", "bfloat16")
+    assert (stream.seed, stream.augmented) == (4, True)
 
 
 @pytest.mark.parametrize(

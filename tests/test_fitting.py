@@ -14,10 +14,10 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from mini_training import STEPS, mini_batches, mini_config, mini_fit, write_data
+from mini_training import STEPS, mini_batches, mini_config, mini_fit, share_training_programs, write_data
 from small import random_variables
 
-from ciassd_jax import fitting, load_weights, open_dataset
+from ciassd_jax import create_train_state, fitting, load_weights, open_dataset
 from ciassd_jax.checkpoint import Checkpoints
 from ciassd_jax.data.batching import WorkerError
 from ciassd_jax.fitting import Fitted, Intervals, TrainingError, find_database, fit
@@ -27,19 +27,10 @@ from ciassd_jax.metrics_log import MetricsLog
 from ciassd_jax.prediction import variables_of
 from ciassd_jax.types import TrainState
 
-_PROGRAMS: dict[Any, Any] = {}
-_compile = fitting._Run._compile
-
 
 @pytest.fixture(autouse=True)
 def _compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    def compile_once(self: Any, batch: Any) -> Any:
-        key = self.config, len(batch.frame)
-        if key not in _PROGRAMS:
-            _PROGRAMS[key] = _compile(self, batch)
-        return _PROGRAMS[key]
-
-    monkeypatch.setattr(fitting._Run, "_compile", compile_once)
+    share_training_programs(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +71,6 @@ def lines(workdir: Path) -> list[dict[str, Any]]:
 
 
 def saved_state(workdir: Path) -> TrainState:
-    from ciassd_jax import create_train_state
-
     like = create_train_state(jax.random.key(0), mini_config(), variables=random_variables(mini_config()))
     with Checkpoints(workdir / "checkpoints", mini_config()) as checkpoints:
         restored = checkpoints.restore(like)
@@ -101,7 +90,7 @@ def test_the_folder_has_everything(whole: tuple[Fitted, Path, list[str]]) -> Non
     }
     assert (workdir / "config.json").read_text().strip() == mini_config().to_json()
     assert json.loads((workdir / "versions.json").read_text())["seed"] == 3
-    # Three frames in batches of two: epochs 4 ends with step 6.
+    # Three frames in batches of two: epoch 4 ends with step 6.
     assert sorted(path.name for path in (workdir / "eval").iterdir()) == ["6", "9"]
     assert {path.name for path in (workdir / "eval" / "9").iterdir()} == {"data", "result.json", "table.txt"}
     assert (workdir / "eval" / "9" / "data" / "000000.txt").is_file()
