@@ -16,10 +16,12 @@ from ciassd_jax.cli.data import Data, Submit
 from ciassd_jax.cli.evaluate import Evaluate
 from ciassd_jax.cli.inference import Convert, Demo, Info, Predict
 from ciassd_jax.cli.messages import UsageError
+from ciassd_jax.cli.train import Train
 from ciassd_jax.formats.errors import FormatError
 
 Command = (
     Annotated[Predict, tyro.conf.subcommand("predict")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]

@@ -1,0 +1,300 @@
+"""The training loop: steps, their record, evaluation and checkpoints in one folder, exactly resumable.
+
+The folder holds config.json, versions.json, metrics.jsonl, tb/, checkpoints/, eval/STEP/, best.safetensors and
+last.safetensors.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from ciassd_jax.checkpoint import Checkpoints
+from ciassd_jax.config import Config
+from ciassd_jax.data.batching import Batches, WorkerError
+from ciassd_jax.data.frames import Dataset
+from ciassd_jax.data.paste import PasteDatabase, build_database, fingerprint_of, open_database
+from ciassd_jax.formats.errors import FormatError, Pathlike
+from ciassd_jax.formats.writing import check_folder
+from ciassd_jax.interruption import signals_noted
+from ciassd_jax.metrics_log import MetricsLog, is_left_out, summarise
+from ciassd_jax.model.detector import init_variables
+from ciassd_jax.prediction import variables_of
+from ciassd_jax.scoring import TRAINED
+from ciassd_jax.training import create_train_state, train_step
+from ciassd_jax.types import Scene, TrainState, Variables
+from ciassd_jax.validation import Validation, write_text
+from ciassd_jax.weights import save_weights
+
+_BEST, _LAST = TRAINED
+# So many updates in a row that are not finite mean that there is no way back.
+_HOPELESS = 20
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the message is one sentence with the remedy."""
+
+
+class Fitted(NamedTuple):
+    """Where a training ended, the best validation score so far, and the signal that stopped it, if one did."""
+
+    state: TrainState
+    best: float | None
+    stopped: int | None
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """How often things are done: lines of the record and checkpoints by steps, evaluation by epochs (0: never).
+
+    Besides, all of it is done at the end. `keep` is the number of checkpoints that stay.
+    """
+
+    log: int = 50
+    save: int = 1000
+    evaluate: int = 10
+    keep: int = 3
+
+    def __post_init__(self) -> None:
+        if min(self.log, self.save, self.keep) < 1 or self.evaluate < 0:
+            raise ValueError(f"{self}: log, save and keep must be at least 1, evaluate at least 0.")
+
+
+def fit(
+    config: Config,
+    batches: Batches,
+    workdir: Pathlike,
+    *,
+    validation: Dataset | None = None,
+    variables: Variables | None = None,
+    intervals: Intervals | None = None,
+    progress: bool = False,
+    say: Callable[[str], object] = print,
+) -> Fitted:
+    """Train for `config.schedule.total_steps` on `make_batches`, from the newest checkpoint in `workdir` where one is.
+
+    A run that was stopped, killed or broke, and is called again in the same way, ends with the same bits as one that
+    was not. Without `variables` to start from they are drawn from the seed of the batches. SIGTERM and Ctrl-C end it
+    after the step, with everything saved. The batches are closed at the end.
+
+    Raises FormatError for a frame, checkpoint or folder that cannot be used, WorkerError for a dead worker, and
+    TrainingError where losses stay not finite; checkpoints stay intact.
+    """
+    intervals, folder = intervals or Intervals(), Path(workdir)
+    check_folder(folder)
+    with ExitStack() as stack:
+        stack.enter_context(batches)
+        stopped = stack.enter_context(signals_noted())
+        checkpoints = stack.enter_context(Checkpoints(folder / "checkpoints", config, keep=intervals.keep))
+        state = _resume(checkpoints, batches, config, say)
+        if state is None:
+            state = create_train_state(jax.random.key(batches.state.seed), config, variables=variables)
+        _describe(folder, config, batches)
+        log = MetricsLog(folder, int(state.step), say)
+        stack.callback(log.close)
+        scored = Validation(validation, config) if validation is not None else None
+        run = _Run(config, folder, scored, intervals, checkpoints, batches, log, say, state, int(state.skipped))
+        run.train(stopped, progress)
+    return Fitted(run.state, run.best, stopped[0] if stopped else None)
+
+
+@dataclass
+class _Run:
+    """A training under way: its parts, and what changes with every step."""
+
+    config: Config
+    folder: Path
+    validation: Validation | None
+    intervals: Intervals
+    checkpoints: Checkpoints
+    batches: Batches
+    log: MetricsLog
+    say: Callable[[str], object]
+    state: TrainState
+    skipped: int
+    pending: list[dict[str, Any]] = field(default_factory=list)
+    since: float = field(default_factory=time.perf_counter)
+
+    @property
+    def best(self) -> float | None:
+        """The best validation score so far, that of the runs before included."""
+        return max((line["score"] for line in self.log.lines if "score" in line), default=None)
+
+    def train(self, stopped: Sequence[int], progress: bool) -> None:
+        """Go to the last step, or as far as a signal lets it."""
+        from tqdm.auto import tqdm
+
+        program, total, step = None, self.config.schedule.total_steps, int(self.state.step)
+        saved = step
+        with tqdm(total=total, initial=step, unit="step", leave=False, disable=None if progress else True) as bar:
+            while step < total and not stopped:
+                try:
+                    batch = next(self.batches)
+                except (FormatError, WorkerError):
+                    # A signal to the whole group ends the workers too.
+                    if not stopped:
+                        self._save(step, saved)
+                        raise
+                    break
+                if program is None:
+                    program = self._compile(batch)
+                self.state, metrics = program(self.state, batch)
+                # One step is under way while the next batch is prepared, never more.
+                if self.pending:
+                    jax.block_until_ready(self.pending[-1])
+                self.pending.append(metrics)
+                step += 1
+                bar.update()
+                saved = self._report(step, saved)
+        self._save(step, saved)
+
+    def _report(self, step: int, saved: int) -> int:
+        """What is due after a step; returns the step that was saved last."""
+        evaluated = self._is_evaluated(step)
+        if not (evaluated or step % self.intervals.save == 0):
+            if step % self.intervals.log == 0:
+                self._write_line(step)
+            return saved
+        self._write_line(step)
+        self._save(step, saved, self._evaluate(step) if evaluated else None)
+        return step
+
+    def _compile(self, batch: Scene) -> Any:
+        """Compile the step once for all, and say what it takes."""
+        start = time.perf_counter()
+        step = jax.jit(train_step, static_argnames=("config", "axis_name"))
+        program = step.lower(self.state, batch, self.config).compile()
+        memory: Any = program.memory_analysis()
+        sizes = ", ".join(
+            f"{name} {size / 1e6:.0f} MB"
+            for name in ("argument", "output", "temp")
+            # Not every backend reports its memory.
+            if (size := getattr(memory, f"{name}_size_in_bytes", None)) is not None
+        )
+        self.say(
+            f"Compiled the step of {len(batch.frame)} scenes for {jax.default_backend()} in "
+            f"{time.perf_counter() - start:.1f} s; memory: {sizes or 'unknown'}."
+        )
+        self.since = time.perf_counter()
+        return program
+
+    def _write_line(self, step: int) -> None:
+        """One line for the steps since the last: means, sums of what was left out, and states as they are now."""
+        if not self.pending:
+            return
+        rows = jax.device_get(self.pending)
+        skipped, self.skipped = int(rows[-1]["skipped"]) - self.skipped, int(rows[-1]["skipped"])
+        numbers = summarise(rows)
+        seconds = (time.perf_counter() - self.since) / len(rows)
+        numbers |= {"epoch": self._epoch(step), "seconds": seconds}
+        self.log.write(step, numbers)
+        self.pending, self.since = [], time.perf_counter()
+        lost = ", ".join(f"{name} {numbers[name]:.0f}" for name in numbers if is_left_out(name) and numbers[name])
+        self.say(
+            f"step {step}/{self.config.schedule.total_steps}  epoch {numbers['epoch']:.2f}  loss {numbers['loss']:.4f}"
+            f"  {seconds:.2f} s a step" + (f"  ({lost})" if lost else "")
+        )
+        if skipped >= _HOPELESS and skipped == len(rows):
+            raise TrainingError(
+                f"The last {skipped} updates were not finite; lower the learning rate, or take --dtype float32, and "
+                "start anew in another folder."
+            )
+
+    def _epoch(self, step: int) -> float:
+        """How often the frames were seen after so many steps."""
+        return step * self.batches.state.batch_size / self.batches.state.frames
+
+    def _is_evaluated(self, step: int) -> bool:
+        """Whether an epoch that is to be evaluated ended with this step, or training does."""
+        every = self.intervals.evaluate
+        if self.validation is None or every == 0:
+            return False
+        ended = self._epoch(step) // every > self._epoch(step - 1) // every
+        return ended or step == self.config.schedule.total_steps
+
+    def _evaluate(self, step: int) -> float | None:
+        """Score the validation frames, and keep the weights if they are the best so far."""
+        assert self.validation is not None
+        numbers = self.validation.score(self.state, self.folder / "eval" / str(step))
+        if not numbers:
+            return None
+        score, best = next(iter(numbers.values())), self.best
+        self.log.write(step, {"score": score, **numbers})
+        self.say(f"step {step}  " + "  ".join(f"{name} {value:.2f}" for name, value in numbers.items()))
+        if best is None or score > best:
+            self._export(_BEST)
+        self.since = time.perf_counter()
+        return score
+
+    def _export(self, name: str) -> None:
+        save_weights(self.folder / name, variables_of(jax.device_get(self.state)), self.config)
+
+    def _save(self, step: int, saved: int, score: float | None = None) -> None:
+        """Save the state after `step`, unless it is already."""
+        self._export(_LAST)
+        if step > saved:
+            self._write_line(step)
+            self.checkpoints.save(self.state, self.batches.state._replace(batch=step), score=score)
+
+
+def _resume(
+    checkpoints: Checkpoints, batches: Batches, config: Config, say: Callable[[str], object]
+) -> TrainState | None:
+    """The state to go on from, with the loader there too; None without a checkpoint."""
+    key, here = jax.random.key(0), jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    variables = jax.eval_shape(partial(init_variables, config=config), key)
+    shapes = jax.eval_shape(lambda start: create_train_state(key, config, variables=start), variables)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
+    restored = checkpoints.restore(like)
+    if restored is None:
+        return None
+    try:
+        batches.set_state(restored.loader)
+    except ValueError as error:
+        raise FormatError(f"{checkpoints.folder} is of another training: {error}") from error
+    say(f"Going on from step {int(restored.state.step)} in {checkpoints.folder}.")
+    return restored.state
+
+
+def _describe(folder: Path, config: Config, batches: Batches) -> None:
+    """Write the config, and what the training ran with."""
+    packages = ("ciassd_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy")
+    facts = {
+        **{name: version(name) for name in packages},
+        "python": platform.python_version(),
+        "devices": [f"{device.platform} {device.device_kind}" for device in jax.devices()],
+        **{name: value for name, value in batches.state._asdict().items() if name != "batch"},
+    }
+    write_text(folder / "config.json", config.to_json())
+    write_text(folder / "versions.json", json.dumps(facts, indent=1))
+
+
+def find_database(
+    dataset: Dataset,
+    places: Sequence[Path],
+    progress: Callable[[range], Iterable[int]] = iter,
+    say: Callable[[str], object] = print,
+) -> PasteDatabase:
+    """The ground-truth database of a data set from the first of these files that belongs to it.
+
+    Where none does it is built in the last place. Raises FormatError for a frame or a place that cannot be used.
+    """
+    fingerprint = fingerprint_of(dataset)
+    for place in places:
+        try:
+            return open_database(place, fingerprint)
+        except FormatError:
+            continue
+    say(f"Collecting the objects to paste from {len(dataset)} frames into {places[-1]}.")
+    build_database(dataset, places[-1], progress)
+    return open_database(places[-1], fingerprint)

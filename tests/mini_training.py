@@ -1,0 +1,67 @@
+"""A training of a few steps on synthetic frames; as a program it trains in the folder that it is given."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mini_folders import NAMES, write_kitti, write_split
+from small import random_variables, small_config
+
+from ciassd_jax import Config, fitting, make_batches, open_dataset
+from ciassd_jax.data.batching import Batches
+from ciassd_jax.fitting import Fitted, Intervals, find_database, fit
+
+STEPS = 9
+_PROGRAMS: dict[Any, Any] = {}
+_compile = fitting._Run._compile
+INTERVALS = Intervals(log=1, save=2, evaluate=4, keep=2)
+
+
+def mini_config(steps: int = STEPS) -> Config:
+    """`small_config()` with a running mean of the weights, so that every part of a state is there."""
+    config = small_config()
+    return replace(
+        config,
+        data=replace(config.data, max_points=1024, max_paste_points=512),
+        schedule=replace(config.schedule, total_steps=steps, batch_size=2, ema_decay=0.9),
+    )
+
+
+def write_data(root: Path) -> Path:
+    write_kitti(root)
+    write_split(root, "train", *NAMES)
+    write_split(root, "val", NAMES[0])
+    return root
+
+
+def mini_batches(root: Path, config: Config, **options: Any) -> Batches:
+    dataset = open_dataset(root, "train")
+    database = find_database(dataset, [root / "objects_train.bin"], say=lambda text: None)
+    return make_batches(dataset, config, **{"seed": 3, "batch_size": 2, "database": database} | options)
+
+
+def mini_fit(root: Path, workdir: Path, say: Callable[[str], object] = lambda text: None, **options: Any) -> Fitted:
+    """Frames, weights, order and augmentation are the same every time."""
+    config = mini_config()
+    chosen = {"variables": random_variables(config), "intervals": INTERVALS, "say": say} | options
+    batches = chosen.pop("batches", None) or mini_batches(root, config)
+    return fit(config, batches, workdir, **chosen)
+
+
+def share_training_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile the step of a config once for all trainings of this process."""
+
+    def compile_once(self: Any, batch: Any) -> Any:
+        key = self.config, len(batch.frame)
+        if key not in _PROGRAMS:
+            _PROGRAMS[key] = _compile(self, batch)
+        return _PROGRAMS[key]
+
+    monkeypatch.setattr(fitting._Run, "_compile", compile_once)
+
+
+if __name__ == "__main__":
+    mini_fit(Path(sys.argv[1]), Path(sys.argv[2]))
