@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 from mini_training import STEPS, mini_batches, mini_config, mini_fit, share_training_programs, write_data
 from small import random_variables
 
@@ -33,6 +34,14 @@ def _compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
     share_training_programs(monkeypatch)
 
 
+@pytest.fixture(autouse=True)
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C as at a terminal: in the background of a shell it is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_data(tmp_path_factory.mktemp("data"))
@@ -46,9 +55,12 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     before = {name: getattr(jax.config, name) for name in names}
     for name, value in zip(names, (str(folder), 0.0), strict=True):
         jax.config.update(name, value)
+    # Whether there is a cache was decided when this process compiled first.
+    compilation_cache.reset_cache()
     yield folder
     for name, value in before.items():
         jax.config.update(name, value)
+    compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +162,7 @@ def test_a_killed_run_goes_on_with_the_same_bits(
     process = subprocess.Popen(
         [sys.executable, str(program), str(root), str(tmp_path)], env={**os.environ, **caching}, stderr=subprocess.PIPE
     )
-    checkpoints, deadline = tmp_path / "checkpoints", time.monotonic() + 60
+    checkpoints, deadline = tmp_path / "checkpoints", time.monotonic() + 300
     # The next checkpoint may be half-written when the first is complete.
     while process.poll() is None and time.monotonic() < deadline:
         if checkpoints.is_dir() and any(path.name.isdigit() for path in checkpoints.iterdir()):
@@ -273,3 +285,11 @@ def test_a_second_signal_acts_as_ever() -> None:
         assert noted == [signal.SIGINT]
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
+
+
+def test_an_ignored_signal_stays_ignored() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with signals_noted() as noted:
+        signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    assert noted == []
