@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ciassd_jax.config import HeadConfig
-from ciassd_jax.model.layers import convolve_2d, uniform_by_fan_in
+from ciassd_jax.model.layers import uniform_by_fan_in
+from ciassd_jax.ops.convolution import convolve_2d
 from ciassd_jax.types import Predictions
 
 
@@ -25,7 +26,7 @@ class Branch(nn.Module):
         init = uniform_by_fan_in(size * size * inputs)
         kernel = self.param("kernel", init, (size, size, inputs, self.channels), jnp.float32)
         around = (size // 2, size // 2)
-        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), padding=(around, around))
+        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), (around, around))
         x = x.astype(jnp.promote_types(self.dtype, jnp.float32))
         if self.use_bias:
             x = x + self.param("bias", init, (self.channels,), jnp.float32).reshape(1, 1, 1, -1)

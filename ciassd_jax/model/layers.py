@@ -12,6 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ciassd_jax.ops.convolution import convolve_2d, upsample_2d
+
 Initializer = Callable[..., Array]
 Convolution = Callable[..., Any]
 
@@ -105,27 +107,6 @@ class SparseConvNormRelu(nn.Module):
         return jnp.where(mask[:, None], nn.relu(x), 0)
 
 
-def convolve_2d(
-    x: Float[Array, "B H W C"],
-    kernel: Float[Array, "Y X C O"],
-    *,
-    padding: tuple[tuple[int, int], tuple[int, int]],
-    stride: int = 1,
-) -> Float[Array, "B H2 W2 O"]:
-    """Cross-correlation with zeros around, in full float32 precision on every device."""
-    if kernel.shape[:2] == (1, 1) and stride == 1:
-        # The same sums as a matrix product: on a CPU in less than half of the time.
-        return jnp.matmul(x, kernel[0, 0], precision=lax.Precision.HIGHEST)
-    return lax.conv_general_dilated(
-        x,
-        kernel,
-        (stride, stride),
-        padding,
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision=lax.Precision.HIGHEST,
-    )
-
-
 class ConvNormRelu(nn.Module):
     """A 2D convolution without bias on [B, H, W, C], BatchNorm, and ReLU where asked."""
 
@@ -142,17 +123,13 @@ class ConvNormRelu(nn.Module):
         shape = (size, size, inputs, self.channels)
         kernel = self.param("kernel", uniform_by_fan_in(size * size * inputs), shape, jnp.float32)
         around = (size // 2, size // 2)
-        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), stride=self.stride, padding=(around, around))
+        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), (around, around), self.stride)
         x = MaskedBatchNorm(self.axis_name, name="norm")(x, train=train)
         return nn.relu(x) if self.relu else x
 
 
 class UpsampleNormRelu(nn.Module):
-    """Transposed 3 x 3 convolution of stride 2 that doubles H and W, BatchNorm, ReLU (SPEC section 5).
-
-    out[2i - 1 + k] += in[i] * kernel[k] per axis. An even output row reads the middle tap alone, an odd one the
-    outer two: four small convolutions, one for each phase, instead of one over a dilated input.
-    """
+    """Transposed 3 x 3 convolution of stride 2 that doubles H and W, BatchNorm, ReLU (SPEC section 5)."""
 
     channels: int
     dtype: jnp.dtype
@@ -165,19 +142,6 @@ class UpsampleNormRelu(nn.Module):
         # torch reads the fan-in of a transposed convolution from its outputs.
         kernel = self.param("kernel", uniform_by_fan_in(9 * self.channels), shape, jnp.float32)
         x = MaskedBatchNorm(self.axis_name, name="norm")(
-            upsample(x.astype(self.dtype), kernel.astype(self.dtype)), train=train
+            upsample_2d(x.astype(self.dtype), kernel.astype(self.dtype)), train=train
         )
         return nn.relu(x)
-
-
-def upsample(x: Float[Array, "B H W C"], kernel: Float[Array, "3 3 C O"]) -> Float[Array, "B H2 W2 O"]:
-    """Transposed convolution of stride 2, padding 1, output padding 1, as four phase convolutions."""
-    taps = {0: (1,), 1: (2, 0)}
-
-    def phase(odd_y: int, odd_x: int) -> Array:
-        part = kernel[jnp.array(taps[odd_y])][:, jnp.array(taps[odd_x])]
-        return convolve_2d(x, part, padding=((0, odd_y), (0, odd_x)))
-
-    rows = [jnp.stack([phase(y, 0), phase(y, 1)], 3) for y in (0, 1)]
-    batch, height, width, _ = x.shape
-    return jnp.stack(rows, 2).reshape(batch, 2 * height, 2 * width, -1)

@@ -1,0 +1,88 @@
+"""2D convolutions and their gradients beside XLA's own and loops."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from ciassd_jax.ops.convolution import convolve_2d, upsample_2d
+
+
+def convolve_by_xla(x: jax.Array, kernel: jax.Array, padding, stride: int) -> jax.Array:
+    dimensions = ("NHWC", "HWIO", "NHWC")
+    return lax.conv_general_dilated(
+        x, kernel, (stride, stride), padding, dimension_numbers=dimensions, precision=lax.Precision.HIGHEST
+    )
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "padding", "stride"),
+    [
+        ((2, 6, 5, 3), (3, 3), ((1, 1), (1, 1)), 1),
+        ((2, 6, 5, 3), (3, 3), ((1, 1), (1, 1)), 2),
+        ((2, 5, 8, 3), (3, 3), ((1, 1), (1, 1)), 2),
+        ((1, 4, 5, 2), (2, 1), ((0, 1), (0, 0)), 1),
+        ((3, 4, 5, 2), (1, 1), ((0, 0), (0, 0)), 1),
+        ((2, 7, 300, 2), (3, 3), ((1, 1), (1, 1)), 1),
+        ((1, 50, 40, 2), (3, 3), ((1, 1), (1, 1)), 1),
+    ],
+)
+def test_value_and_gradients_are_xlas(shape, size, padding, stride):
+    """Rows of which one, several, or all fit into a block; odd and even sizes with a stride."""
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        x, kernel = jnp.array(rng.normal(size=shape)), jnp.array(rng.normal(size=(*size, shape[-1], 4)))
+
+        def run(function):
+            loss = lambda *arrays: jnp.sin(function(*arrays, padding, stride)).sum()  # noqa: E731
+            return jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(x, kernel)
+
+        close = partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-10)
+        jax.tree.map(close, run(convolve_2d), run(convolve_by_xla))
+
+
+def test_gradient_of_bfloat16_is_accumulated_in_float32():
+    """Ten thousand cells of 1: a bfloat16 sum would stand still at 256."""
+    x, kernel = jnp.ones((1, 100, 100, 1), jnp.bfloat16), jnp.ones((1, 1, 1, 1), jnp.bfloat16)
+    gradient = jax.grad(lambda kernel: convolve_2d(x, kernel, ((0, 0), (0, 0))).astype(jnp.float32).sum())(kernel)
+    assert gradient.dtype == jnp.bfloat16
+    np.testing.assert_allclose(np.float32(gradient), 1e4, rtol=1e-2)
+
+
+def upsample_loop(x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """SPEC section 5: out[2i - 1 + k] += in[i] * kernel[k] along each axis."""
+    batch, height, width, _ = x.shape
+    out = np.zeros((batch, 2 * height, 2 * width, kernel.shape[-1]))
+    for i, j, k, m in np.ndindex(height, width, 3, 3):
+        row, column = 2 * i - 1 + k, 2 * j - 1 + m
+        if 0 <= row < 2 * height and 0 <= column < 2 * width:
+            out[:, row, column] += x[:, i, j] @ kernel[k, m]
+    return out
+
+
+def upsample_by_dilation(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    return lax.conv_general_dilated(
+        x,
+        kernel[::-1, ::-1],
+        (1, 1),
+        [(1, 2), (1, 2)],
+        lhs_dilation=(2, 2),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=lax.Precision.HIGHEST,
+    )
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 4, 5), (1, 1, 1, 2), (1, 5, 2, 3)])
+def test_upsample_is_the_transposed_convolution(shape):
+    rng = np.random.default_rng(0)
+    x, kernel = rng.normal(size=shape), rng.normal(size=(3, 3, shape[-1], 4))
+    arrays = jnp.float32(x), jnp.float32(kernel)
+    np.testing.assert_allclose(upsample_2d(*arrays), upsample_loop(x, kernel), rtol=0, atol=1e-5)
+
+    def run(function):
+        return jax.jit(jax.value_and_grad(lambda *a: jnp.sin(function(*a)).sum(), argnums=(0, 1)))(*arrays)
+
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5), run(upsample_2d), run(upsample_by_dilation))
