@@ -17,6 +17,7 @@ from ciassd_jax.model.layers import (
     SparseConvNormRelu,
     UpsampleNormRelu,
 )
+from ciassd_jax.ops.convolution import upsample_2d
 
 CHANNELS = 5
 
