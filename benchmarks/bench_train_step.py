@@ -208,9 +208,9 @@ def against_voxels(options: argparse.Namespace, config: Config, peer: Callable |
     for share in SHARES:
         scenes = [thinned(scene, share) for scene in whole]
         add("fixed capacity", measure(fixed, peer, scenes, config))
-        if options.scale_capacity:
-            # A cloud loses voxels more slowly than points.
-            smaller = scaled(config, min(1.0, share + 0.25))
+        if options.scale_capacity and share < 1:
+            # A cloud loses voxels a little more slowly than points.
+            smaller = scaled(config, share + 0.1)
             add("capacity scaled", measure(OurStep(smaller, whole[0]), None, scenes, config))
     return series
 
