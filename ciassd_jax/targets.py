@@ -30,7 +30,7 @@ def assign_targets(
     best = iou.max(0)
     rows = jnp.arange(iou.shape[0], dtype=jnp.int32)[:, None]
     # Where the largest is first, as argmax says, which takes a CPU four times as long.
-    first = jnp.where(iou == best, rows, iou.shape[0] - 1).min(0)
+    first = jnp.where(iou == best[None], rows, iou.shape[0] - 1).min(0)
     best_of_truth = iou.max(1, keepdims=True)
     forced = jnp.any((iou == best_of_truth) & (best_of_truth > 0), 0)
     matched, unmatched = (
