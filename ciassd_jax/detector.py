@@ -92,6 +92,12 @@ class Detector:
         self._variables = jax.device_put(variables_of(variables))
         self._programs: dict[int, jax.stages.Compiled] = {}
 
+    def with_variables(self, variables: Variables) -> Detector:
+        """The same detector with other weights; both share their compiled programs."""
+        other = Detector(variables, self.config)
+        other._programs = self._programs
+        return other
+
     @classmethod
     def from_pretrained(cls, path_or_name: str | os.PathLike[str]) -> Detector:
         """Load a weights file (`.safetensors` of ours or a released `.pth`), or bundled weights by name."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import platform
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,17 +18,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+from jax.sharding import Mesh
 
+from ciassd_jax import parallel
 from ciassd_jax.checkpoint import Checkpoints
 from ciassd_jax.config import Config
 from ciassd_jax.data.batching import Batches, WorkerError
 from ciassd_jax.data.frames import Dataset
-from ciassd_jax.data.paste import PasteDatabase, build_database, fingerprint_of, open_database
 from ciassd_jax.formats.errors import FormatError, Pathlike
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.interruption import signals_noted
 from ciassd_jax.metrics_log import MetricsLog, is_left_out, summarise
 from ciassd_jax.model.detector import init_variables
+from ciassd_jax.parallel import FAILED, ParallelError, agreed, from_first, is_first, on_first, replicated
 from ciassd_jax.prediction import variables_of
 from ciassd_jax.scoring import TRAINED
 from ciassd_jax.training import create_train_state, train_step
@@ -81,31 +83,38 @@ def fit(
     progress: bool = False,
     say: Callable[[str], object] = print,
 ) -> Fitted:
-    """Train for `config.schedule.total_steps` on `make_batches`, from the newest checkpoint in `workdir` where one is.
+    """Train for `config.schedule.total_steps` on `batches`, from the newest checkpoint in `workdir` where one is.
 
-    A run that was stopped, killed or broke, and is called again in the same way, ends with the same bits as one that
-    was not. Without `variables` to start from they are drawn from the seed of the batches. SIGTERM and Ctrl-C end it
-    after the step, with everything saved. The batches are closed at the end.
+    The scenes of a batch are shared by all devices of all processes, each of which calls this with its own `shard` of
+    the batches and the same folder; only the first one writes and speaks. A run that was stopped, killed or broke, and
+    is called again in the same way, ends with the same bits as one that was not; on other devices it goes on as well.
+    Without `variables` to start from they are drawn from the seed of the batches. SIGTERM and Ctrl-C, to any process,
+    end it after the step, with everything saved. The batches are closed at the end.
 
-    Raises FormatError for a frame, checkpoint or folder that cannot be used, WorkerError for a dead worker, and
-    TrainingError where losses stay not finite; checkpoints stay intact.
+    Raises FormatError for a frame, checkpoint or folder that cannot be used, WorkerError for a dead worker,
+    TrainingError where losses stay not finite, and ParallelError where the processes cannot share a batch or another
+    one failed; checkpoints stay intact.
     """
     intervals, folder = intervals or Intervals(), Path(workdir)
+    say = say if is_first() else lambda text: None
     check_folder(folder)
     with ExitStack() as stack:
         stack.enter_context(batches)
-        stopped = stack.enter_context(signals_noted())
+        noted = stack.enter_context(signals_noted())
+        mesh = parallel.data_mesh(batches.state.batch_size)
         checkpoints = stack.enter_context(Checkpoints(folder / "checkpoints", config, keep=intervals.keep))
-        state = _resume(checkpoints, batches, config, say)
+        state = _resume(checkpoints, batches, config, mesh, say)
         if state is None:
             state = create_train_state(jax.random.key(batches.state.seed), config, variables=variables)
-        _describe(folder, config, batches)
-        log = MetricsLog(folder, int(state.step), say)
-        stack.callback(log.close)
+            # Copies, as every step gives up the memory of the state before.
+            state = parallel.replicate(state, mesh)
+        log = on_first(partial(_begin_record, folder, config, batches, int(state.step), say))
+        if log is not None:
+            stack.callback(log.close)
         scored = Validation(validation, config) if validation is not None else None
-        run = _Run(config, folder, scored, intervals, checkpoints, batches, log, say, state, int(state.skipped))
-        run.train(stopped, progress)
-    return Fitted(run.state, run.best, stopped[0] if stopped else None)
+        run = _Run(config, folder, scored, intervals, checkpoints, batches, mesh, log, say, state, int(state.skipped))
+        stopped = run.train(noted, progress and is_first())
+    return Fitted(run.state, run.best, stopped)
 
 
 @dataclass
@@ -118,7 +127,8 @@ class _Run:
     intervals: Intervals
     checkpoints: Checkpoints
     batches: Batches
-    log: MetricsLog
+    mesh: Mesh
+    log: MetricsLog | None
     say: Callable[[str], object]
     state: TrainState
     skipped: int
@@ -127,25 +137,27 @@ class _Run:
 
     @property
     def best(self) -> float | None:
-        """The best validation score so far, that of the runs before included."""
-        return max((line["score"] for line in self.log.lines if "score" in line), default=None)
+        """The best validation score so far, that of the runs before included; only the first process knows."""
+        lines = self.log.lines if self.log is not None else ()
+        return max((line["score"] for line in lines if "score" in line), default=None)
 
-    def train(self, stopped: Sequence[int], progress: bool) -> None:
-        """Go to the last step, or as far as a signal lets it."""
+    def train(self, noted: Sequence[int], progress: bool) -> int | None:
+        """Go to the last step, or as far as a signal to any of the processes lets it; returns that signal."""
         from tqdm.auto import tqdm
 
         program, total, step = None, self.config.schedule.total_steps, int(self.state.step)
-        saved = step
+        saved, ended, failure = step, 0, None
         with tqdm(total=total, initial=step, unit="step", leave=False, disable=None if progress else True) as bar:
-            while step < total and not stopped:
+            while step < total:
                 try:
                     batch = next(self.batches)
-                except (FormatError, WorkerError):
-                    # A signal to the whole group ends the workers too.
-                    if not stopped:
-                        self._save(step, saved)
-                        raise
+                except (FormatError, WorkerError) as error:
+                    failure = error
+                # A signal to the whole group ends the workers too, and comes first.
+                ended = agreed(noted[0] if noted else FAILED if failure else 0)
+                if ended:
                     break
+                batch = parallel.shard_batch(batch, self.mesh)
                 if program is None:
                     program = self._compile(batch)
                 self.state, metrics = program(self.state, batch)
@@ -157,6 +169,9 @@ class _Run:
                 bar.update()
                 saved = self._report(step, saved)
         self._save(step, saved)
+        if ended == FAILED:
+            raise failure or ParallelError("Another process cannot go on, and says why; what was trained is saved.")
+        return ended or None
 
     def _report(self, step: int, saved: int) -> int:
         """What is due after a step; returns the step that was saved last."""
@@ -172,8 +187,8 @@ class _Run:
     def _compile(self, batch: Scene) -> Any:
         """Compile the step once for all, and say what it takes."""
         start = time.perf_counter()
-        step = jax.jit(train_step, static_argnames=("config", "axis_name"))
-        program = step.lower(self.state, batch, self.config).compile()
+        step: Any = parallel.shard_step(partial(train_step, config=self.config), self.mesh)
+        program = step.lower(self.state, batch).compile()
         memory: Any = program.memory_analysis()
         sizes = ", ".join(
             f"{name} {size / 1e6:.0f} MB"
@@ -182,7 +197,7 @@ class _Run:
             if (size := getattr(memory, f"{name}_size_in_bytes", None)) is not None
         )
         self.say(
-            f"Compiled the step of {len(batch.frame)} scenes for {jax.default_backend()} in "
+            f"Compiled the step of {len(batch.frame)} scenes for {parallel.describe(self.mesh)} in "
             f"{time.perf_counter() - start:.1f} s; memory: {sizes or 'unknown'}."
         )
         self.since = time.perf_counter()
@@ -197,7 +212,7 @@ class _Run:
         numbers = summarise(rows)
         seconds = (time.perf_counter() - self.since) / len(rows)
         numbers |= {"epoch": self._epoch(step), "seconds": seconds}
-        self.log.write(step, numbers)
+        self._record(step, numbers)
         self.pending, self.since = [], time.perf_counter()
         lost = ", ".join(f"{name} {numbers[name]:.0f}" for name in numbers if is_left_out(name) and numbers[name])
         self.say(
@@ -222,9 +237,18 @@ class _Run:
         ended = self._epoch(step) // every > self._epoch(step - 1) // every
         return ended or step == self.config.schedule.total_steps
 
+    def _record(self, step: int, numbers: dict[str, float]) -> None:
+        on_first(lambda: self.log.write(step, numbers) if self.log is not None else None)
+
     def _evaluate(self, step: int) -> float | None:
-        """Score the validation frames, and keep the weights if they are the best so far."""
+        """Score the validation frames on the first process, and keep the weights if they are the best so far."""
+        score = from_first(on_first(partial(self._score, step)))
+        self.since = time.perf_counter()
+        return score
+
+    def _score(self, step: int) -> float | None:
         assert self.validation is not None
+        assert self.log is not None
         numbers = self.validation.score(self.state, self.folder / "eval" / str(step))
         if not numbers:
             return None
@@ -233,28 +257,27 @@ class _Run:
         self.say(f"step {step}  " + "  ".join(f"{name} {value:.2f}" for name, value in numbers.items()))
         if best is None or score > best:
             self._export(_BEST)
-        self.since = time.perf_counter()
         return score
 
     def _export(self, name: str) -> None:
-        save_weights(self.folder / name, variables_of(jax.device_get(self.state)), self.config)
+        save_weights(self.folder / name, jax.device_get(variables_of(self.state)), self.config)
 
     def _save(self, step: int, saved: int, score: float | None = None) -> None:
         """Save the state after `step`, unless it is already."""
-        self._export(_LAST)
+        on_first(partial(self._export, _LAST))
         if step > saved:
             self._write_line(step)
             self.checkpoints.save(self.state, self.batches.state._replace(batch=step), score=score)
 
 
 def _resume(
-    checkpoints: Checkpoints, batches: Batches, config: Config, say: Callable[[str], object]
+    checkpoints: Checkpoints, batches: Batches, config: Config, mesh: Mesh, say: Callable[[str], object]
 ) -> TrainState | None:
     """The state to go on from, with the loader there too; None without a checkpoint."""
-    key, here = jax.random.key(0), jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    key, everywhere = jax.random.key(0), replicated(mesh)
     variables = jax.eval_shape(partial(init_variables, config=config), key)
     shapes = jax.eval_shape(lambda start: create_train_state(key, config, variables=start), variables)
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=here), shapes)
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=everywhere), shapes)
     restored = checkpoints.restore(like)
     if restored is None:
         return None
@@ -266,8 +289,10 @@ def _resume(
     return restored.state
 
 
-def _describe(folder: Path, config: Config, batches: Batches) -> None:
-    """Write the config, and what the training ran with."""
+def _begin_record(
+    folder: Path, config: Config, batches: Batches, step: int, say: Callable[[str], object]
+) -> MetricsLog:
+    """Write the config and what the training runs with, and open its record at a step."""
     packages = ("ciassd_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy")
     facts = {
         **{name: version(name) for name in packages},
@@ -277,24 +302,4 @@ def _describe(folder: Path, config: Config, batches: Batches) -> None:
     }
     write_text(folder / "config.json", config.to_json())
     write_text(folder / "versions.json", json.dumps(facts, indent=1))
-
-
-def find_database(
-    dataset: Dataset,
-    places: Sequence[Path],
-    progress: Callable[[range], Iterable[int]] = iter,
-    say: Callable[[str], object] = print,
-) -> PasteDatabase:
-    """The ground-truth database of a data set from the first of these files that belongs to it.
-
-    Where none does it is built in the last place. Raises FormatError for a frame or a place that cannot be used.
-    """
-    fingerprint = fingerprint_of(dataset)
-    for place in places:
-        try:
-            return open_database(place, fingerprint)
-        except FormatError:
-            continue
-    say(f"Collecting the objects to paste from {len(dataset)} frames into {places[-1]}.")
-    build_database(dataset, places[-1], progress)
-    return open_database(places[-1], fingerprint)
+    return MetricsLog(folder, step, say)

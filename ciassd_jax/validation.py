@@ -31,11 +31,10 @@ class Validation:
 
     def score(self, state_or_variables: Variables, folder: Path) -> dict[str, float]:
         """AP of the weights, and in `folder` its whole result.json and table.txt, and data/NAME.txt of every frame."""
-        detector = Detector(jax.device_get(variables_of(state_or_variables)), self._config)
-        if self._detector is not None:
-            # A program depends on the config alone; compiling takes longer than many frames.
-            detector._programs = self._detector._programs
-        self._detector = detector
+        variables = jax.device_get(variables_of(state_or_variables))
+        if self._detector is None:
+            self._detector = Detector(variables, self._config)
+        detector = self._detector.with_variables(variables)
         frames = detect_dataset(detector, self._dataset)
         evaluation = score_frames(frames)
         write_frames(frames, folder / "data")
@@ -65,7 +64,7 @@ def count_found(variables: Variables, dataset: Dataset, config: Config, limit: f
 
     Targets are the labelled objects of a class, of any difficulty, whose centre lies in the grid.
     """
-    detector, found, targets = Detector(variables, config), 0, 0
+    detector, found, targets = Detector(jax.device_get(variables_of(variables)), config), 0, 0
     low, high = np.array(config.grid.minimum), np.array(config.grid.maximum)
     for index in range(len(dataset)):
         frame = dataset.read(index)

@@ -17,6 +17,7 @@ LAYERS = [
         "checkpoint",
         "metrics_log",
         "interruption",
+        "parallel",
         "validation",
         "fitting",
         "training",

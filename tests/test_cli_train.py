@@ -1,6 +1,7 @@
 """`ciassd train`, called in this process: it trains, goes on, and says in one sentence what it cannot use."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -112,8 +113,9 @@ def test_overfit_one_takes_that_frame_alone_and_reports(
     assert "Frame 000001: 0 of 2 objects are found at a 3D overlap of 0.7." in done.out
     ((config, stream, options),) = fits
     assert (stream.dataset.names, stream.augmented, stream.database) == (("000001",), False, None)
-    assert options["validation"].names == ("000001",)
-    assert (config.schedule.total_steps, config.schedule.batch_size) == (500, 1)
+    # Found or not says more of one frame than its average precision.
+    assert options["validation"] is None
+    assert (config.schedule.total_steps, config.schedule.batch_size, config.schedule.learning_rate) == (800, 1, 1e-3)
 
 
 def test_options_go_to_the_config(run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path) -> None:
@@ -137,6 +139,7 @@ def test_options_go_to_the_config(run: Callable[..., Run], fits: list[tuple[Any,
         ({"split": "none"}, "none"),
         ({"data": "nowhere"}, "nowhere"),
         ({"init-from": "nowhere.safetensors"}, "is no file"),
+        ({"num-processes": 2}, "give all three"),
     ],
 )
 def test_what_cannot_be_used_is_one_sentence(
@@ -160,13 +163,35 @@ def test_a_workdir_that_cannot_be_is_one_sentence(run: Callable[..., Run], tmp_p
     assert (tmp_path / "file").read_text() == "kept"
 
 
-def test_a_label_that_is_none_names_its_frame(run: Callable[..., Run], tmp_path: Path) -> None:
+def test_a_read_only_workdir_is_one_sentence(
+    run: Callable[..., Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The superuser may write everywhere.
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    refused = run(workdir=tmp_path)
+    assert (refused.code, refused.out) == (2, "")
+    assert refused.err == f"error: {tmp_path} cannot be written, as {tmp_path} is read-only; choose another place.\n"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        (9, "nan", "000004.txt, line 1: a value is not finite"),
+        (8, "-1.5", "Frame 000004: object 0 (Car) has the size"),
+        (0, "Lorry", "000004.txt: the type 'Lorry' is none of KITTI's"),
+    ],
+)
+def test_a_label_that_is_none_names_its_frame(
+    column: int, value: str, words: str, run: Callable[..., Run], tmp_path: Path
+) -> None:
     data = write_data(tmp_path / "data")
     label = data / "training" / "label_2" / "000004.txt"
     fields = label.read_text().split(" ")
-    fields[9] = "nan"
+    fields[column] = value
     label.write_text(" ".join(fields))
     refused = run(workdir=tmp_path / "w", data=data)
     assert refused.code == 2
-    assert "000004" in refused.err
-    assert "Traceback" not in refused.err
+    assert words in refused.err
+    assert refused.err.startswith("error: ")
+    assert refused.err.count("\n") == 1

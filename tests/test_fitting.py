@@ -21,7 +21,8 @@ from small import random_variables
 from ciassd_jax import create_train_state, fitting, load_weights, open_dataset
 from ciassd_jax.checkpoint import Checkpoints
 from ciassd_jax.data.batching import WorkerError
-from ciassd_jax.fitting import Fitted, Intervals, TrainingError, find_database, fit
+from ciassd_jax.data.folders import find_database
+from ciassd_jax.fitting import Fitted, Intervals, TrainingError, fit
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.interruption import signals_noted
 from ciassd_jax.metrics_log import MetricsLog
@@ -107,7 +108,7 @@ def test_the_folder_has_everything(whole: tuple[Fitted, Path, list[str]]) -> Non
     assert {path.name for path in (workdir / "eval" / "9").iterdir()} == {"data", "result.json", "table.txt"}
     assert (workdir / "eval" / "9" / "data" / "000000.txt").is_file()
     assert {"8", "9"} <= {path.name for path in (workdir / "checkpoints").iterdir()}
-    assert sum(text.startswith("Compiled the step of 2 scenes for cpu in ") for text in said) == 1
+    assert sum(text.startswith("Compiled the step of 2 scenes for 2 cpu devices in ") for text in said) == 1
     assert sum("tensorboardX" in text for text in said) == 1
 
 

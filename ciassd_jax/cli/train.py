@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 # Options that replace a field of the config's schedule.
 _SCHEDULE = ("batch_size", "kind", "learning_rate", "weight_decay", "accumulate", "ema_decay", "rematerialize")
-# One frame is learnt by heart in so many steps.
-_OVERFIT_STEPS = 500
+# One frame is learnt by heart so; the running statistics of the batch norms need the last hundreds of steps to settle.
+_OVERFIT = {"total_steps": 800, "learning_rate": 1e-3, "batch_size": 1}
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Train:
     seed: int = 0
     """Of the weights, the order of the frames and the augmentation."""
     steps: int | None = None
-    """How many steps in all (the preset's schedule: 55680; 500 with --overfit-one)."""
+    """How many steps in all (the preset's schedule: 55680; 800 with --overfit-one)."""
     epochs: int | None = None
     """Or how many passes over the frames."""
     batch_size: int | None = None
@@ -71,7 +72,7 @@ class Train:
     kind: Literal["one_cycle", "cosine"] | None = None
     """Schedule of the learning rate (one_cycle)."""
     learning_rate: float | None = None
-    """Its peak (0.003)."""
+    """Its peak (0.003; 0.001 with --overfit-one)."""
     weight_decay: float | None = None
     """Decoupled decay of all parameters (0.01)."""
     accumulate: int | None = None
@@ -88,6 +89,13 @@ class Train:
     """Epochs between two evaluations; 0 for none."""
     keep: int = 3
     """So many of the last checkpoints stay, and the best."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0 where several train together, each started with the same options but for its index; SLURM
+    and TPU pods are recognised without, "auto" tries any other cluster that JAX knows."""
+    num_processes: int | None = None
+    """How many processes train together."""
+    process_index: int | None = None
+    """Which of them this is, from 0."""
 
     def run(self) -> int:
         from tqdm.auto import tqdm
@@ -96,13 +104,15 @@ class Train:
         from ciassd_jax.data.folders import find_root
         from ciassd_jax.fitting import TrainingError
         from ciassd_jax.formats.writing import check_folder
+        from ciassd_jax.parallel import ParallelError, connect, is_first
 
         root = find_root(self.data)
         check_folder(self.workdir)
         with warnings_as_lines(root), _storage_silenced():
             try:
-                return self._train(root, tqdm.write)
-            except (WorkerError, TrainingError) as error:
+                connect(self.coordinator, self.num_processes, self.process_index)
+                return self._train(root, tqdm.write if is_first() else lambda text: None)
+            except (WorkerError, TrainingError, ParallelError) as error:
                 raise UsageError(str(error)) from error
 
     def _train(self, root: Path, say: Any) -> int:
@@ -112,7 +122,7 @@ class Train:
         dataset = open_dataset(root, self.split, self.image_size)
         validation = None
         if self.overfit_one is not None:
-            dataset = validation = self._one_frame(dataset, self.overfit_one)
+            dataset = self._one_frame(dataset, self.overfit_one)
         elif self.validate is not None and self.evaluate_every:
             validation = open_dataset(root, self.validate, self.image_size)
         config, intervals = self._config(len(dataset)), self._intervals()
@@ -143,7 +153,7 @@ class Train:
         config = PRESETS[self.preset]()
         given = {name: getattr(self, name) for name in _SCHEDULE if getattr(self, name) is not None}
         if self.overfit_one is not None:
-            given = {"total_steps": _OVERFIT_STEPS, "batch_size": 1} | given
+            given = _OVERFIT | given
         with _refused_as_usage():
             schedule = replace(config.schedule, **given)
             steps = self.steps if self.epochs is None else self.epochs * frames // schedule.batch_size
@@ -159,6 +169,7 @@ class Train:
 
     def _batches(self, dataset: Dataset, config: Config, database: PasteDatabase | None) -> Batches:
         from ciassd_jax.data.batching import make_batches
+        from ciassd_jax.parallel import shard
 
         with _refused_as_usage():
             return make_batches(
@@ -169,6 +180,7 @@ class Train:
                 database=database,
                 augmented=self.overfit_one is None,
                 workers=self.workers,
+                shard=shard(),
             )
 
     def _one_frame(self, dataset: Dataset, name: str) -> Dataset:
@@ -181,14 +193,16 @@ class Train:
 
     def _database(self, dataset: Dataset, config: Config, root: Path, say: Any) -> PasteDatabase | None:
         """The data set's own database, or one in the workdir; none where nothing is pasted."""
-        from ciassd_jax.data.folders import database_path
-        from ciassd_jax.fitting import find_database
+        from ciassd_jax.data.folders import database_path, find_database
+        from ciassd_jax.parallel import on_first
 
         pasted = config.data.augmentation.paste and any(one.paste_up_to for one in config.classes)
         if self.overfit_one is not None or not pasted:
             return None
         places = [database_path(folder, self.split) for folder in (root, self.workdir)]
-        return find_database(dataset, places, _progress, say)
+        find = partial(find_database, dataset, places, _progress, say)
+        # The others open what the first one may have to build.
+        return on_first(find) or find()
 
     def _variables(self, config: Config) -> Variables | None:
         from ciassd_jax.detector import find_weights
@@ -201,9 +215,10 @@ class Train:
         return weights.variables
 
     def _report_overfit(self, state: Any, dataset: Dataset, config: Config, say: Any) -> int:
+        from ciassd_jax.parallel import on_first
         from ciassd_jax.validation import count_found
 
-        found, targets = count_found(state, dataset, config)
+        found, targets = on_first(partial(count_found, state, dataset, config)) or (0, 0)
         say(f"Frame {self.overfit_one}: {found} of {targets} objects are found at a 3D overlap of 0.7.")
         return 0 if found == targets else 1
 

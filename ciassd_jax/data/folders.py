@@ -1,13 +1,15 @@
-"""A data set from its folder, whichever layout it has."""
+"""A data set from its folder, whichever layout it has, and its database."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from ciassd_jax.data.custom import open_custom
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.kitti import open_kitti
+from ciassd_jax.data.paste import PasteDatabase, build_database, fingerprint_of, open_database
 from ciassd_jax.formats.errors import FormatError, Pathlike
 
 
@@ -38,6 +40,27 @@ def find_root(root: Pathlike | None) -> Path:
 def database_path(folder: Path, split: str) -> Path:
     """The file of a split's ground-truth database."""
     return folder / f"objects_{split}.bin"
+
+
+def find_database(
+    dataset: Dataset,
+    places: Sequence[Path],
+    progress: Callable[[range], Iterable[int]] = iter,
+    say: Callable[[str], object] = print,
+) -> PasteDatabase:
+    """The ground-truth database of a data set from the first of these files that belongs to it.
+
+    Where none does it is built in the last place. Raises FormatError for a frame or a place that cannot be used.
+    """
+    fingerprint = fingerprint_of(dataset)
+    for place in places:
+        try:
+            return open_database(place, fingerprint)
+        except FormatError:
+            continue
+    say(f"Collecting the objects to paste from {len(dataset)} frames into {places[-1]}.")
+    build_database(dataset, places[-1], progress)
+    return open_database(places[-1], fingerprint)
 
 
 def is_custom(root: Path) -> bool:

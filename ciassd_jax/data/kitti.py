@@ -67,8 +67,12 @@ def read_kitti_frame(
 
 
 def read_objects(path: Path) -> list[ObjectRow]:
-    """The rows of a label file without DontCare."""
-    return [row for row in read_rows(path) if row.type != IGNORED]
+    """The rows of a label file without DontCare; raises FormatError for a type that is none of KITTI's."""
+    rows = [row for row in read_rows(path) if row.type != IGNORED]
+    unknown = next((row.type for row in rows if row.type not in TYPES), None)
+    if unknown is not None:
+        raise FormatError(f"{path}: the type '{unknown}' is none of KITTI's; write {', '.join(TYPES)} or {IGNORED}.")
+    return rows
 
 
 def read_seen_points(folder: Path, name: str, camera: Camera) -> Float32[np.ndarray, "P 4"]:
