@@ -1,0 +1,66 @@
+"""One of several processes that train together; `test_parallel.py` starts them.
+
+`python tests/processes.py update OUT [COORDINATOR COUNT INDEX]` makes one update of the small network in float64, and
+writes gradients, parameters and metrics to OUT; `train STOP ARGUMENTS` is `ciassd train` of the small network in place
+of `tiny`, which gets SIGTERM in the step after STOP (0: never).
+"""
+
+import os
+import signal
+import sys
+from functools import partial
+from pathlib import Path
+
+# Eight devices, unless one each is asked for below.
+from devices import CONFIG, gradient_of, scenes
+
+os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
+
+import jax
+import numpy as np
+from mini_training import mini_config
+from small import random_variables, small_config
+
+from ciassd_jax import create_train_state, parallel, train_step
+from ciassd_jax.cli import main
+from ciassd_jax.presets import PRESETS
+
+
+def update(out: Path) -> None:
+    """An update of eight scenes, of which each process has its share."""
+    jax.config.update("jax_enable_x64", True)
+    batch, (index, count) = scenes("one empty"), parallel.shard()
+    share = len(batch.frame) // count
+    rows = jax.tree.map(lambda leaf: leaf[index * share : (index + 1) * share], batch)
+    mesh = parallel.data_mesh(len(batch.frame))
+    wide = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float64))
+    state = create_train_state(jax.random.key(0), CONFIG, variables=wide(random_variables(small_config())))
+    step = parallel.shard_step(partial(train_step, config=CONFIG), mesh)
+    after, metrics = step(parallel.replicate(state, mesh), parallel.shard_batch(rows, mesh))
+    found = {"gradient": gradient_of(after), "params": after.params, "metrics": metrics}
+    if parallel.is_first():
+        leaves = jax.tree_util.tree_leaves_with_path(jax.device_get(found))
+        np.savez(out, **{jax.tree_util.keystr(path): leaf for path, leaf in leaves})
+
+
+def train(stop: int, arguments: list[str]) -> int:
+    PRESETS["tiny"] = mini_config
+    place, taken = parallel.shard_batch, []
+
+    def shard_batch(*given):
+        taken.append(None)
+        if len(taken) == stop:
+            signal.raise_signal(signal.SIGTERM)
+        return place(*given)
+
+    parallel.shard_batch = shard_batch
+    return main(["train", *arguments])
+
+
+if __name__ == "__main__":
+    what, first, *others = sys.argv[1:]
+    if what == "train":
+        sys.exit(train(int(first), others))
+    if others:
+        parallel.connect(others[0], int(others[1]), int(others[2]))
+    update(Path(first))
