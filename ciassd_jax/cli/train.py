@@ -259,4 +259,4 @@ def _refused_as_usage() -> Iterator[None]:
 def _progress(items: Sequence[Item]) -> Iterable[Item]:
     from tqdm.auto import tqdm
 
-    return tqdm(items, unit="frame", leave=False)
+    return tqdm(items, unit="frame", leave=False, disable=None)
