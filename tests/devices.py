@@ -2,13 +2,15 @@
 
 `python tests/devices.py [--all]`: on 2 by pmap and 4 by a sharded batch, or both ways on 1, 2, 4 and 8 (minutes).
 
-Prints one JSON line: for every case the largest difference of gradients (relative to the largest gradient of a leaf),
-parameters, batch statistics and metrics (relative). Run by test_training.py in a process of its own.
+Prints one JSON line: whether a checkpoint of one device has the same bits on four and the other way round; and for
+every case the largest difference of gradients (relative to the largest gradient of a leaf), parameters, batch
+statistics and metrics (relative). Run by test_training.py in a process of its own.
 """
 
 import json
 import os
 import sys
+import tempfile
 
 # The programs run once each, so that optimising them would take most of the time.
 os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=8 --xla_backend_optimization_level=0"
@@ -20,10 +22,12 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding
 from small import random_scene, random_variables, small_config
 
 from ciassd_jax import create_train_state, train_step
+from ciassd_jax.checkpoint import Checkpoints
+from ciassd_jax.data.batching import LoaderState
 from ciassd_jax.types import Scene
 
 SCENES = 8
@@ -77,11 +81,23 @@ def on_mesh(state, batch: Scene, devices: int):
     return jax.jit(train_step, static_argnames="config")(whole, split, CONFIG)
 
 
+def restores(state, saved: Sharding, restored: Sharding) -> bool:
+    """Whether a state saved from some devices comes back to others, with the same bits and on all of them."""
+    with tempfile.TemporaryDirectory() as folder, Checkpoints(folder, CONFIG) as checkpoints:
+        checkpoints.save(jax.device_put(state, saved), LoaderState(0, 0, SCENES, 1, 0))
+        checkpoints.wait()
+        found = checkpoints.restore(jax.device_put(state, restored))
+    assert found is not None
+    same = jax.tree.map(lambda a, b: bool((np.asarray(a) == np.asarray(b)).all()), found.state, state)
+    return jax.tree.all(same) and {leaf.sharding for leaf in jax.tree.leaves(found.state)} == {restored}
+
+
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     wide = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float64))
     state = create_train_state(jax.random.key(0), CONFIG, variables=wide(random_variables(small_config())))
-    found = {}
+    one, four = (NamedSharding(Mesh(np.array(jax.devices()[:n]), ("scenes",)), PartitionSpec()) for n in (1, 4))
+    found = {"restored": {"1 to 4": restores(state, one, four), "4 to 1": restores(state, four, one)}}
     alone = jax.jit(train_step, static_argnames="config")
     for kind in ("unequal", "one empty"):
         batch = scenes(kind)

@@ -16,13 +16,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small import random_scene, random_variables, small_config
+from small import random_scene, random_variables, small_cloud, small_config
 
-from ciassd_jax import Config, car, create_train_state, train_step
+from ciassd_jax import Config, car, create_train_state, make_batches, train_step
+from ciassd_jax.data.batching import finish_scenes
+from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.prediction import variables_of
 from ciassd_jax.training import learning_rate, make_optimizer, momentum
 from ciassd_jax.training_config import ScheduleConfig
-from ciassd_jax.types import Scene
+from ciassd_jax.types import Boxes, Scene
 
 step = jax.jit(train_step, static_argnames=("config", "axis_name"))
 
@@ -154,6 +156,26 @@ def test_empty_scenes_stay_finite(empty):
     assert jax.tree.all(jax.tree.map(lambda leaf: bool(jnp.isfinite(leaf).all()), state.params))
 
 
+def test_an_epoch_of_all_sizes_is_traced_once():
+    """Frames without points, without boxes, and with more points than fit, in one program of each part."""
+    config, clouds = short(small_config()), {"many": 5000, "none": 0, "one": 1, "some": 300, "few": 40, "usual": 600}
+
+    def read(name: str) -> Frame:
+        objects = 0 if name in ("none", "few") else 2
+        boxes = Boxes.from_array(np.tile([8.0, 1, -1, 3.9, 1.6, 1.5, 0.3], (objects, 1)))
+        points = small_cloud(count=clouds[name])
+        return Frame(name, points, boxes, ("Car",) * objects, np.zeros(objects, np.int64), None)
+
+    state, sizes = fresh(config), []
+    with make_batches(Dataset(tuple(clouds), read), config, seed=0, batch_size=2) as batches:
+        for _ in range(3):
+            state, metrics = step(state, next(batches), config)
+            sizes.append((step._cache_size(), finish_scenes._cache_size()))
+    assert len(set(sizes)) == 1
+    assert all(np.isfinite(value) for value in metrics.values())
+    assert int(state.skipped) == 0
+
+
 def test_running_mean_of_the_parameters_serves_prediction():
     config = short(small_config(), ema_decay=0.5)
     start = fresh(config)
@@ -205,6 +227,7 @@ def test_several_devices_make_the_same_update():
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
+    assert found.pop("restored") == {"1 to 4": True, "4 to 1": True}
     assert set(found) == {f"{case} {scenes}" for case in ("pmap 2", "sharded 4") for scenes in ("unequal", "one empty")}
     for case, difference in found.items():
         assert difference["gradient"] <= 1e-6, case
