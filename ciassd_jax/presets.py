@@ -45,6 +45,8 @@ def car_lite() -> Config:
     the most sites, only strides.
     """
     return Config(
+        # A map of cells of twice the size has a quarter of the boxes around a car that could support one another.
+        classes=(replace(CAR, support_threshold=CAR.support_threshold / 4),),
         grid=GridConfig(voxel_size=(0.1, 0.1, 0.2), max_voxels=14000),
         backbone=BackboneConfig(
             stages=(
