@@ -59,10 +59,13 @@ def precisions(evaluation: Evaluation, config: Config) -> dict[str, float]:
     return found
 
 
-def count_found(variables: Variables, dataset: Dataset, config: Config, limit: float = 0.7) -> tuple[int, int]:
-    """Of how many targets in all frames one is found with its class and at least so much 3D overlap, and of how many.
+def count_found(
+    variables: Variables, dataset: Dataset, config: Config, limit: float = 0.7, *, hardest: int | None = None
+) -> tuple[int, int]:
+    """How many targets in all frames are found with their class and at least so much 3D overlap, and of how many.
 
-    Targets are the labelled objects of a class, of any difficulty, whose centre lies in the grid.
+    Targets are the labelled objects of a class whose centre lies in the grid, of any difficulty, or of KITTI's up to
+    `hardest` (0 easy, 1 moderate, 2 hard).
     """
     detector, found, targets = Detector(jax.device_get(variables_of(variables)), config), 0, 0
     low, high = np.array(config.grid.minimum), np.array(config.grid.maximum)
@@ -72,7 +75,10 @@ def count_found(variables: Variables, dataset: Dataset, config: Config, limit: f
         boxes = Boxes.from_array(result.boxes.astype(np.float64))
         label = target_labels(frame, config)
         center = frame.boxes.center
-        for row in np.flatnonzero((label >= 0) & ((center >= low) & (center <= high)).all(-1)):
+        wanted = (label >= 0) & ((center >= low) & (center <= high)).all(-1)
+        if hardest is not None:
+            wanted &= (frame.difficulty >= 0) & (frame.difficulty <= hardest)
+        for row in np.flatnonzero(wanted):
             overlap = iou_3d(Boxes(*(leaf[row][None] for leaf in frame.boxes)), boxes)
             same = np.array([name == config.class_names[label[row]] for name in result.labels], bool)
             found += bool((same & (overlap >= limit)).any())

@@ -118,9 +118,21 @@ def load_released_weights(path: str | os.PathLike[str]) -> Weights:
     return _released(tensors, path)
 
 
-def save_weights(path: str | os.PathLike[str], variables: Variables, config: Config) -> None:
-    """Write our own file, whole or not at all: float32 variables, and the config and class names as metadata."""
+def save_weights(
+    path: str | os.PathLike[str], variables: Variables, config: Config, *, half_kernels: bool = False
+) -> None:
+    """Write our own file, whole or not at all: the variables, and the config and class names as metadata.
+
+    Everything is float32, but for the kernels in float16 with `half_kernels`, which halves the file; what normalises
+    stays. Raises FormatError for a kernel that is too large for float16.
+    """
     flat = {_name(keys): np.asarray(leaf) for keys, leaf in _leaves(variables)}
+    if half_kernels:
+        largest = float(np.finfo(np.float16).max)
+        for name in [name for name in flat if name.endswith("/kernel")]:
+            if not np.abs(flat[name]).max() <= largest:
+                raise FormatError(f"{name} exceeds {largest:.0f}, the largest float16; write the file in float32.")
+            flat[name] = flat[name].astype(np.float16)
     metadata = {"format": FORMAT, "config": config.to_json(), "class_names": json.dumps(config.class_names)}
     with replacing(path) as temporary:
         temporary.write_bytes(safetensors.numpy.save(flat, metadata=metadata))

@@ -54,6 +54,25 @@ def test_what_is_saved_is_loaded(ours: Path) -> None:
     assert list(ours.parent.iterdir()) == [ours]
 
 
+def test_half_kernels_are_rounded_and_nothing_else(tmp_path: Path) -> None:
+    config, variables = small_config(), random_variables(small_config())
+    save_weights(tmp_path / "half.safetensors", variables, config, half_kernels=True)
+
+    def rounded(keys: tuple, leaf: np.ndarray) -> np.ndarray:
+        return np.float32(np.float16(leaf)) if keys[-1].key == "kernel" else leaf
+
+    assert_same(
+        load_weights(tmp_path / "half.safetensors").variables, jax.tree_util.tree_map_with_path(rounded, variables)
+    )
+
+
+def test_a_kernel_beyond_float16_is_named(tmp_path: Path) -> None:
+    variables = jax.tree.map(lambda leaf: leaf * np.float32(1e6), random_variables(small_config()))
+    with pytest.raises(FormatError, match=r"params/.*/kernel exceeds 65504"):
+        save_weights(tmp_path / "half.safetensors", variables, small_config(), half_kernels=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_saved_metadata_names_the_classes(ours: Path) -> None:
     with safetensors.safe_open(ours, framework="numpy") as file:
         assert json.loads(file.metadata()["class_names"]) == ["Car"]

@@ -87,26 +87,31 @@ class Predict:
 
 @dataclass(frozen=True)
 class Convert:
-    """Convert the authors' published weights to a file of ours, with a report for every tensor."""
+    """Convert the authors' published weights to a file of ours, with a report for every tensor.
+
+    With --half also a file of ours to one of half the size.
+    """
 
     source: Annotated[Path, tyro.conf.Positional]
     """A released .pth (read without torch; nothing in it is run), or a .safetensors with the released names."""
     out: Annotated[Path, tyro.conf.Positional]
     """The file to write: OUT.safetensors."""
+    half: bool = False
+    """Write the kernels in float16."""
 
     def run(self) -> int:
         from ciassd_jax.formats.writing import check_folder
-        from ciassd_jax.weights import load_released_weights, save_weights
+        from ciassd_jax.weights import load_released_weights, load_weights, save_weights
 
         if self.out.suffix != ".safetensors":
             raise FormatError(f"{self.out} must end in .safetensors; name the output so.")
         if self.out.resolve() == self.source.resolve():
             raise FormatError(f"{self.out} is the input itself; name another output.")
         check_folder(self.out.parent)
-        weights = load_released_weights(self.source)
+        weights = (load_weights if self.half else load_released_weights)(self.source)
         for row in weights.report:
             print(f"{row.status:<10}  {row.source:<58}  {row.target:<50}  {row.shape}")
-        save_weights(self.out, weights.variables, weights.config)
+        save_weights(self.out, weights.variables, weights.config, half_kernels=self.half)
         used = sum(row.status != "counter" for row in weights.report)
         print(f"Wrote {self.out}: {used} tensors; {len(weights.report) - used} counters were not needed.")
         return 0

@@ -7,9 +7,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Float
-
-from ciassd_jax.types import Array
+from jaxtyping import Array, Float
 
 Padding = tuple[tuple[int, int], tuple[int, int]]
 
@@ -52,7 +50,7 @@ def _backward(padding: Padding, stride: int, saved: tuple[Array, Array], gradien
         (to_kernel,) = jax.linear_transpose(lambda kernel: convolve(x, kernel), kernel)(gradient)
         return to_kernel
 
-    blocked = partial(_kernel_gradient, size=kernel.shape[:2], padding=padding, stride=stride)
+    blocked = partial(_kernel_gradient, size=(kernel.shape[0], kernel.shape[1]), padding=padding, stride=stride)
     return to_x, lax.platform_dependent(x, gradient, cpu=blocked, default=whole)
 
 

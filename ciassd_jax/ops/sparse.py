@@ -7,7 +7,8 @@ in gradient. `sparse_dense.py` holds the definition that this must equal.
 
 from __future__ import annotations
 
-import functools
+from functools import partial, wraps
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -102,8 +103,7 @@ def _convolve_backward(
     saved: tuple[Array, NeighbourTable, Array], gradient: Float[Array, "V O"]
 ) -> tuple[Array, NeighbourTable, Array]:
     features, table, kernel = saved
-    to_features = _gather_multiply(gradient, table.outputs, jnp.swapaxes(kernel, 1, 2))
-    to_kernel = _kernel_gradient(features, table.inputs, gradient).reshape(kernel.shape).astype(kernel.dtype)
+    to_features, to_kernel = _gradients(gradient, table.outputs, jnp.swapaxes(kernel, 1, 2), features)
     no_gradient = NeighbourTable(*(np.zeros(t.shape, jax.dtypes.float0) for t in table))
     return to_features, no_gradient, to_kernel
 
@@ -114,9 +114,9 @@ convolve.defvjp(_convolve_forward, _convolve_backward)
 def _per_platform(function):  # type: ignore[no-untyped-def]
     """Run `function(*arrays, rows=...)` with the block size of the platform that it is lowered for."""
 
-    @functools.wraps(function)
-    def choose(*arrays: Array) -> Array:
-        branches = {name: functools.partial(function, rows=rows) for name, rows in _BLOCK_ROWS.items()}
+    @wraps(function)
+    def choose(*arrays: Array) -> Any:
+        branches = {name: partial(function, rows=rows) for name, rows in _BLOCK_ROWS.items()}
         return lax.platform_dependent(*arrays, **branches)
 
     return choose
@@ -175,22 +175,28 @@ def _gather_multiply(features: Array, index: Array, kernel: Array, *, rows: int)
 
 
 @_per_platform
-def _kernel_gradient(features: Array, index: Array, gradient: Array, *, rows: int) -> Array:
-    slots, out = index.shape[0], gradient.shape[-1]
+def _gradients(gradient: Array, index: Array, kernel: Array, features: Array, *, rows: int) -> tuple[Array, Array]:
+    """Gradients of features and kernel [K, C, O] from the output's, of which one gather serves both.
+
+    `index` [U, K] says which outputs read a feature row, and `kernel` is [K, O, C].
+    """
+    slots, columns, (out, channels) = features.shape[0], index.shape[1], kernel.shape[1:]
     rows = _even_rows(slots, rows)
-    index, order, occupied = _blocks(index, features.shape[0], rows)
-    padded = jnp.pad(features, ((0, 1), (0, 0)))
-    gradient = jnp.pad(gradient, ((0, index.shape[0] - slots), (0, 0)))
-    accumulator = _accumulator(features.dtype)
+    index, order, occupied = _blocks(index, gradient.shape[0], rows)
+    padded = jnp.pad(gradient, ((0, 1), (0, 0)))
+    features = jnp.pad(features, ((0, index.shape[0] - slots), (0, 0)))
+    multiply = partial(jnp.matmul, precision=lax.Precision.HIGHEST, preferred_element_type=_accumulator(features.dtype))
 
-    def accumulate(i: Array, total: Array) -> Array:
+    def accumulate(i: Array, results: tuple[Array, Array]) -> tuple[Array, Array]:
+        to_features, to_kernel = results
         start = order[i] * rows
-        return total + jnp.matmul(
-            _gathered(padded, index, start, rows).T,
-            lax.dynamic_slice_in_dim(gradient, start, rows),
-            precision=lax.Precision.HIGHEST,
-            preferred_element_type=accumulator,
-        )
+        gathered = _gathered(padded, index, start, rows)
+        block = multiply(gathered, kernel.reshape(-1, channels)).astype(features.dtype)
+        to_features = lax.dynamic_update_slice_in_dim(to_features, block, start, 0)
+        return to_features, to_kernel + multiply(lax.dynamic_slice_in_dim(features, start, rows).T, gathered)
 
-    zero = jnp.zeros((index.shape[1] * features.shape[1], out), accumulator)
-    return lax.fori_loop(jnp.int32(0), occupied, accumulate, zero)
+    empty = zeros_after(occupied, features.shape, features.dtype)
+    zero = jnp.zeros((channels, columns * out), _accumulator(features.dtype))
+    to_features, to_kernel = lax.fori_loop(jnp.int32(0), occupied, accumulate, (empty, zero))
+    to_kernel = to_kernel.reshape(channels, columns, out).transpose(1, 0, 2)
+    return to_features[:slots], to_kernel.astype(kernel.dtype)
