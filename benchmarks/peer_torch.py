@@ -198,7 +198,7 @@ def overlap_area(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """
     outline = torch.tensor([[-0.5, -0.5], [-0.5, 0.5], [0.5, 0.5], [0.5, -0.5]]) * a[:, None, 2:4]
     outline = torch.view_as_complex(outline) * torch.exp(-1j * a[:, 4:])
-    outline = outline + torch.view_as_complex((a - b)[:, None, :2].contiguous())
+    outline = outline + torch.complex(*(a - b)[:, None, :2].unbind(-1))
     outline = torch.view_as_real(outline * torch.exp(1j * b[:, 4:]))
     for axis in (0, 1):  # every edge gets two more corners, where it crosses the two borders of this axis
         edge, border = outline.roll(-1, 1) - outline, b[:, 2 + axis, None, None] / 2

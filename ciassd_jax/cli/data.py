@@ -132,7 +132,7 @@ class Submit:
 def _progress(items: Sequence[Item]) -> Iterable[Item]:
     from tqdm.auto import tqdm
 
-    return tqdm(items, unit="frame", leave=False)
+    return tqdm(items, unit="frame", leave=False, disable=None)
 
 
 def _listing(findings: Sequence[Finding], most: int) -> list[str]:

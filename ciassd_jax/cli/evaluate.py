@@ -136,7 +136,7 @@ class Evaluate:
 def _progress(names: Sequence[str]) -> Iterable[str]:
     from tqdm.auto import tqdm
 
-    return tqdm(names, unit="frame")
+    return tqdm(names, unit="frame", disable=None)
 
 
 def _text(evaluation: Evaluation) -> str:

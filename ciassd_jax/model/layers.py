@@ -9,10 +9,10 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ciassd_jax.ops.convolution import convolve_2d, upsample_2d
+from ciassd_jax.ops.normalization import batch_norm, scale_and_shift
 
 Initializer = Callable[..., Array]
 Convolution = Callable[..., Any]
@@ -34,8 +34,8 @@ def uniform_by_fan_in(fan_in: int) -> Initializer:
 class MaskedBatchNorm(nn.Module):
     """BatchNorm over the real entries of the whole batch, on all devices when `axis_name` is given.
 
-    Sums and counts are pooled before they are divided, so that unequal devices weigh as their entries do and an
-    empty one, or an empty batch, stays finite (it leaves the running statistics as they were). Float32 always.
+    An empty device, or an empty batch, stays finite; the latter leaves the running statistics as they were. Float32
+    always.
     """
 
     axis_name: str | None = None
@@ -49,36 +49,14 @@ class MaskedBatchNorm(nn.Module):
         bias = self.param("bias", nn.initializers.zeros, (channels,), jnp.float32)
         mean = self.variable("batch_stats", "mean", jnp.zeros, (channels,), jnp.float32)
         variance = self.variable("batch_stats", "var", jnp.ones, (channels,), jnp.float32)
-        if train:
-            used_mean, used_variance, empty = self._batch_statistics(x, mask)
-            if not self.is_initializing():
-                for running, new in ((mean, used_mean), (variance, used_variance)):
-                    updated = MOMENTUM * running.value + (1 - MOMENTUM) * new
-                    running.value = jnp.where(empty, running.value, updated)
-        else:
-            used_mean, used_variance = mean.value, variance.value
-        factor = scale * lax.rsqrt(used_variance + EPSILON)
-        shape = (1,) * (x.ndim - 1) + (channels,)
-        result = x * factor.reshape(shape) + (bias - used_mean * factor).reshape(shape)
-        return result.astype(x.dtype)
-
-    def _batch_statistics(self, x: Array, mask: Array | None) -> tuple[Array, Array, Array]:
-        """Mean and biased variance of the real entries, and whether there are none."""
-        axes = tuple(range(x.ndim - 1))
-        values = x.astype(jnp.promote_types(x.dtype, jnp.float32))
-        real = jnp.ones(x.shape[:-1], bool) if mask is None else mask
-        count = real.sum(dtype=values.dtype)
-        total = jnp.where(real[..., None], values, 0).sum(axes)
-        if self.axis_name is not None:
-            total, count = lax.psum((total, count), self.axis_name)
-        entries = jnp.maximum(count, 1)
-        mean = total / entries
-        # Around the mean, not from the mean square: no cancellation.
-        spread = jnp.where(real[..., None], values - mean.reshape((1,) * len(axes) + (-1,)), 0)
-        squares = (spread**2).sum(axes)
-        if self.axis_name is not None:
-            squares = lax.psum(squares, self.axis_name)
-        return mean, squares / entries, count == 0
+        if not train:
+            return scale_and_shift(x, scale, bias, mean.value, variance.value, epsilon=EPSILON)
+        result, *moments, count = batch_norm(x, mask, scale, bias, EPSILON, self.axis_name)
+        if not self.is_initializing():
+            for running, new in zip((mean, variance), moments, strict=True):
+                updated = MOMENTUM * running.value + (1 - MOMENTUM) * new
+                running.value = jnp.where(count == 0, running.value, updated)
+        return result
 
 
 class SparseConvNormRelu(nn.Module):
