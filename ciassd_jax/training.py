@@ -28,14 +28,14 @@ def create_train_state(key: jax.Array, config: Config, *, variables: Variables |
     """A fresh state at step 0; `variables` ({"params", "batch_stats"}) replace the random ones."""
     start = init_variables(key, config) if variables is None else variables
     params = jax.tree.map(jnp.asarray, start["params"])
-    zero = jnp.zeros((), jnp.int32)
+    # Two zeros: a step to which the state is donated may not get one buffer twice.
     return TrainState(
-        step=zero,
+        step=jnp.zeros((), jnp.int32),
         params=params,
         batch_stats=jax.tree.map(jnp.asarray, start["batch_stats"]),
         optimizer=make_optimizer(config.schedule).init(params),
         ema=jax.tree.map(jnp.copy, params) if config.schedule.ema_decay else None,
-        skipped=zero,
+        skipped=jnp.zeros((), jnp.int32),
     )
 
 
