@@ -123,8 +123,10 @@ def test_three_classes_add_classes_only():
 
 @pytest.mark.parametrize("make", [car_lite, tiny])
 def test_small_presets_keep_the_method(make):
-    """They resize the grid and the network, and leave the head, the classes and the rules of detection alone."""
-    sizes = re.compile(r"grid\.|backbone\.|neck\.channels|detection\.max_candidates|data\.max_")
+    """They resize the grid and the network, with the support of a box, and leave the other rules and the head alone."""
+    sizes = re.compile(
+        r"grid\.|backbone\.|neck\.channels|detection\.max_candidates|data\.max_|classes\[0\]\.support_threshold"
+    )
     changed = differences(make(), car())
     assert changed
     assert all(sizes.match(path) for path in changed), changed
