@@ -6,12 +6,14 @@ order, and a batch may straddle two of them. So the loader's state is the number
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import threading
 import zlib
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from multiprocessing.util import Finalize
@@ -32,6 +34,8 @@ from ciassd_jax.types import Array, Boxes, PasteObjects, Scene
 _AHEAD, _READY = 2, 2
 # Seeds, positions and checksums fit an int32, so that a state passes through any checkpoint.
 _LIMIT = 2**31
+# Seconds between two looks at the workers.
+_PATIENCE = 2.0
 _DIED = "Worker process was terminated"
 
 
@@ -196,6 +200,8 @@ class Batches(Iterator[Scene]):
         self._rows, self._workers, self._taken = rows, workers, start
         self._host: list[Any] = []
         self._ready: deque[Scene] = deque()
+        self._processes: set[Any] = set()
+        self._others: set[Any] = set()
         # Before multiprocessing ends the workers itself, which leaves shared memory behind.
         Finalize(self, _close_host, (self._host,), exitpriority=100)
 
@@ -215,13 +221,32 @@ class Batches(Iterator[Scene]):
     def _prepare(self) -> None:
         """Hand batches to the device until enough are under way."""
         if not self._host:
+            self._others, self._processes = set(multiprocessing.active_children()), set()
             self._host.append(host_batches(self._rows, workers=self._workers, start=self._taken))
         seed = np.array(self._rows.stream.seed or 0, np.int32)
         wanted = min(1 + _AHEAD, self._rows.batches - self._taken)
         while len(self._ready) < wanted:
             # A copy: the device may read an array until it is done, and these are in memory that workers share.
-            host = jax.tree.map(np.array, next(self._host[0]))
+            host = jax.tree.map(np.array, self._next_host())
             self._ready.append(finish_scenes(host, seed, self._rows.stream.config))
+
+    def _next_host(self) -> Any:
+        """The host's next batch; a worker killed while it writes would leave grain waiting for the rest for good."""
+        if not self._workers:
+            return next(self._host[0])
+        waiting = ThreadPoolExecutor(1)
+        answer = waiting.submit(next, self._host[0])
+        waiting.shutdown(wait=False)
+        while not answer.done():
+            wait([answer], timeout=_PATIENCE / 20)
+            self._processes |= set(multiprocessing.active_children()) - self._others
+            dead = [process.exitcode for process in self._processes if process.exitcode]
+            if dead and not wait([answer], timeout=_PATIENCE).done:
+                for process in self._processes:
+                    process.kill()
+                self._host.clear()
+                raise RuntimeError(f"{_DIED} with exit code {dead[0]}.")
+        return answer.result()
 
     @property
     def state(self) -> LoaderState:

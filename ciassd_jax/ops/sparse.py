@@ -185,7 +185,7 @@ def _gradients(gradient: Array, index: Array, kernel: Array, features: Array, *,
     index, order, occupied = _blocks(index, gradient.shape[0], rows)
     padded = jnp.pad(gradient, ((0, 1), (0, 0)))
     # Padding slots may hold anything, and nobody reads them.
-    read = (index < gradient.shape[0]).any(1)[:, None]
+    read = jnp.any(index < gradient.shape[0], 1, keepdims=True)
     features = jnp.where(read, jnp.pad(features, ((0, index.shape[0] - slots), (0, 0))), 0)
     multiply = partial(jnp.matmul, precision=lax.Precision.HIGHEST, preferred_element_type=_accumulator(features.dtype))
 
