@@ -23,8 +23,9 @@ from jax.sharding import Mesh
 from ciassd_jax import parallel
 from ciassd_jax.checkpoint import Checkpoints
 from ciassd_jax.config import Config
-from ciassd_jax.data.batching import Batches, WorkerError
+from ciassd_jax.data.batching import Batches
 from ciassd_jax.data.frames import Dataset
+from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import FormatError, Pathlike
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.interruption import signals_noted

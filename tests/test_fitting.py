@@ -20,8 +20,8 @@ from small import random_variables
 
 from ciassd_jax import create_train_state, fitting, load_weights, open_dataset
 from ciassd_jax.checkpoint import Checkpoints
-from ciassd_jax.data.batching import WorkerError
 from ciassd_jax.data.folders import find_database
+from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.fitting import Fitted, Intervals, TrainingError, fit
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.interruption import signals_noted

@@ -100,8 +100,8 @@ class Train:
     def run(self) -> int:
         from tqdm.auto import tqdm
 
-        from ciassd_jax.data.batching import WorkerError
         from ciassd_jax.data.folders import find_root
+        from ciassd_jax.data.workers import WorkerError
         from ciassd_jax.fitting import TrainingError
         from ciassd_jax.formats.writing import check_folder
         from ciassd_jax.parallel import ParallelError, connect, is_first

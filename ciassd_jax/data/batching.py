@@ -6,14 +6,12 @@ order, and a batch may straddle two of them. So the loader's state is the number
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import threading
 import zlib
 from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from multiprocessing.util import Finalize
@@ -28,15 +26,13 @@ from ciassd_jax.data.augment import augment, keep_targets, scene_key
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.data.paste import PasteDatabase, draw_objects, no_objects
 from ciassd_jax.data.scenes import pad_frame
+from ciassd_jax.data.workers import Watched
 from ciassd_jax.types import Array, Boxes, PasteObjects, Scene
 
 # Batches under way on the device while the caller uses one, and those ready in each worker, or in the reading thread.
 _AHEAD, _READY = 2, 2
 # Seeds, positions and checksums fit an int32, so that a state passes through any checkpoint.
 _LIMIT = 2**31
-# Seconds between two looks at the workers.
-_PATIENCE = 2.0
-_DIED = "Worker process was terminated"
 
 
 class LoaderState(NamedTuple):
@@ -50,10 +46,6 @@ class LoaderState(NamedTuple):
     batch_size: int
     frames: int
     checksum: int
-
-
-class WorkerError(RuntimeError):
-    """A worker process died; the message is one sentence with the usual causes."""
 
 
 class HostScene(NamedTuple):
@@ -160,7 +152,8 @@ def host_batches(rows: Rows, *, workers: int = 0, start: int = 0) -> Any:
     # Small leaves go through the pipe: a block of shared memory each would cost more.
     batches = grain.experimental.WithOptionsIterDataset(batches, grain.experimental.DatasetOptions(min_shm_size=2**16))
     options = grain.MultiprocessingOptions(num_workers=workers, per_worker_buffer_size=_READY)
-    return iter(batches.mp_prefetch(options, _begin_worker))
+    each = iter(batches.mp_prefetch(options, _begin_worker))
+    return Watched(each) if workers else each
 
 
 def _begin_worker(index: int, count: int) -> None:
@@ -200,8 +193,6 @@ class Batches(Iterator[Scene]):
         self._rows, self._workers, self._taken = rows, workers, start
         self._host: list[Any] = []
         self._ready: deque[Scene] = deque()
-        self._processes: set[Any] = set()
-        self._others: set[Any] = set()
         # Before multiprocessing ends the workers itself, which leaves shared memory behind.
         Finalize(self, _close_host, (self._host,), exitpriority=100)
 
@@ -210,10 +201,8 @@ class Batches(Iterator[Scene]):
             raise StopIteration
         try:
             self._prepare()
-        except BaseException as error:
+        except BaseException:
             self.close()
-            if isinstance(error, RuntimeError) and str(error).startswith(_DIED):
-                raise WorkerError(_describe_death(error)) from None
             raise
         self._taken += 1
         return self._ready.popleft()
@@ -221,32 +210,13 @@ class Batches(Iterator[Scene]):
     def _prepare(self) -> None:
         """Hand batches to the device until enough are under way."""
         if not self._host:
-            self._others, self._processes = set(multiprocessing.active_children()), set()
             self._host.append(host_batches(self._rows, workers=self._workers, start=self._taken))
         seed = np.array(self._rows.stream.seed or 0, np.int32)
         wanted = min(1 + _AHEAD, self._rows.batches - self._taken)
         while len(self._ready) < wanted:
             # A copy: the device may read an array until it is done, and these are in memory that workers share.
-            host = jax.tree.map(np.array, self._next_host())
+            host = jax.tree.map(np.array, next(self._host[0]))
             self._ready.append(finish_scenes(host, seed, self._rows.stream.config))
-
-    def _next_host(self) -> Any:
-        """The host's next batch; a worker killed while it writes would leave grain waiting for the rest for good."""
-        if not self._workers:
-            return next(self._host[0])
-        waiting = ThreadPoolExecutor(1)
-        answer = waiting.submit(next, self._host[0])
-        waiting.shutdown(wait=False)
-        while not answer.done():
-            wait([answer], timeout=_PATIENCE / 20)
-            self._processes |= set(multiprocessing.active_children()) - self._others
-            dead = [process.exitcode for process in self._processes if process.exitcode]
-            if dead and not wait([answer], timeout=_PATIENCE).done:
-                for process in self._processes:
-                    process.kill()
-                self._host.clear()
-                raise RuntimeError(f"{_DIED} with exit code {dead[0]}.")
-        return answer.result()
 
     @property
     def state(self) -> LoaderState:
@@ -283,14 +253,6 @@ class Batches(Iterator[Scene]):
 def _close_host(host: list[Any]) -> None:
     while host:
         host.pop().close()
-
-
-def _describe_death(error: RuntimeError) -> str:
-    code = str(error).partition("exit code ")[2].partition(".")[0]
-    return (
-        f"A worker of the loader died (exit code {code}): memory may have run out, so take fewer workers or a smaller "
-        "batch, or the script that starts them lacks `if __name__ == '__main__':`; then go on from the last checkpoint."
-    )
 
 
 def make_batches(

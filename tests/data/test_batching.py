@@ -16,10 +16,11 @@ from mini_folders import NAMES, write_kitti, write_split
 
 from ciassd_jax import Config, Scene, car_lite, make_batches, one_pass, open_dataset, tiny
 from ciassd_jax.data.augment import augment, keep_targets, scene_key
-from ciassd_jax.data.batching import Batches, LoaderState, Rows, Stream, WorkerError, epoch_order, finish_scenes
+from ciassd_jax.data.batching import Batches, LoaderState, Rows, Stream, epoch_order, finish_scenes
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.paste import PasteDatabase, build_database, draw_objects, fingerprint_of, no_objects, open_database
 from ciassd_jax.data.scenes import pad_frame
+from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.training_config import AugmentationConfig, DataConfig
 
