@@ -27,7 +27,7 @@ from ciassd_jax.data.batching import Batches
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import FormatError, Pathlike
-from ciassd_jax.formats.writing import check_folder
+from ciassd_jax.formats.writing import check_folder, write_text
 from ciassd_jax.interruption import signals_noted
 from ciassd_jax.metrics_log import MetricsLog, is_left_out, summarise
 from ciassd_jax.model.detector import init_variables
@@ -36,7 +36,7 @@ from ciassd_jax.prediction import variables_of
 from ciassd_jax.scoring import TRAINED
 from ciassd_jax.training import create_train_state, train_step
 from ciassd_jax.types import Scene, TrainState, Variables
-from ciassd_jax.validation import Validation, write_text
+from ciassd_jax.validation import Validation
 from ciassd_jax.weights import save_weights
 
 _BEST, _LAST = TRAINED

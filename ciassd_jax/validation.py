@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import jax
@@ -12,9 +11,9 @@ from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.scenes import target_labels
 from ciassd_jax.detector import Detector
-from ciassd_jax.evaluation import Evaluation, format_block, format_tables, to_json
+from ciassd_jax.evaluation import Evaluation, format_json, format_report
 from ciassd_jax.evaluation.kitti_ap import LIMITS
-from ciassd_jax.formats.writing import replacing
+from ciassd_jax.formats.writing import write_text
 from ciassd_jax.ops.iou import iou_3d
 from ciassd_jax.predict_files import detect_in_view
 from ciassd_jax.prediction import variables_of
@@ -38,8 +37,8 @@ class Validation:
         frames = detect_dataset(detector, self._dataset)
         evaluation = score_frames(frames)
         write_frames(frames, folder / "data")
-        write_text(folder / "result.json", json.dumps(to_json(evaluation), indent=1, allow_nan=False))
-        write_text(folder / "table.txt", f"{format_block(evaluation)}\n\n{format_tables(evaluation)}".strip())
+        write_text(folder / "result.json", format_json(evaluation))
+        write_text(folder / "table.txt", format_report(evaluation))
         return precisions(evaluation, self._config)
 
 
@@ -84,9 +83,3 @@ def count_found(
             found += bool((same & (overlap >= limit)).any())
             targets += 1
     return found, targets
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file of text, whole or not at all."""
-    with replacing(path) as temporary:
-        temporary.write_text(f"{text}\n", encoding="utf-8")

@@ -222,3 +222,14 @@ def paper_di_nms_loop(
         supported = bool(support > support_threshold[candidate])
         clusters.append(Cluster(candidate, support, supported, members, mean / total, refined[candidate]))
     return clusters
+
+
+def upsample_loop(x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """SPEC section 5: out[2i - 1 + k] += in[i] * kernel[k] along each axis."""
+    batch, height, width, _ = x.shape
+    out = np.zeros((batch, 2 * height, 2 * width, kernel.shape[-1]))
+    for i, j, k, m in np.ndindex(height, width, 3, 3):
+        row, column = 2 * i - 1 + k, 2 * j - 1 + m
+        if 0 <= row < 2 * height and 0 <= column < 2 * width:
+            out[:, row, column] += x[:, i, j] @ kernel[k, m]
+    return out

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from ciassd_jax.cli.inference import Preset
-from ciassd_jax.cli.messages import warnings_as_lines
+from ciassd_jax.cli.messages import frames_with_bar, warnings_as_lines
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.presets import PRESETS
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from ciassd_jax.check import PerfectScore
     from ciassd_jax.data.findings import Finding, Report
 
-Item = TypeVar("Item")
 Root = Annotated[Path | None, tyro.conf.Positional]
 
 
@@ -42,7 +41,7 @@ class Check:
         from ciassd_jax.data.check import check_dataset
 
         config = PRESETS[self.preset]()
-        report = check_dataset(self.root, self.split, config=config, image_size=self.image_size, track=_progress)
+        report = check_dataset(self.root, self.split, config=config, image_size=self.image_size, track=frames_with_bar)
         scores = score_truth(report.frames)
         findings = [*report.findings, *find_imperfect(scores)]
         for part in (_listing(findings, self.most), _table(report), _score_table(scores)):
@@ -80,9 +79,9 @@ class Prepare:
             if self.reduce:
                 if is_custom(root):
                     raise FormatError(f"{root} has no camera to crop clouds to; leave out --reduce.")
-                print(f"Wrote {write_reduced(root, self.image_size, _progress)} cropped clouds.")
+                print(f"Wrote {write_reduced(root, self.image_size, frames_with_bar)} cropped clouds.")
             dataset = open_dataset(root, self.split, self.image_size)
-            build_database(dataset, path, _progress)
+            build_database(dataset, path, frames_with_bar)
         print(f"Wrote the objects of {len(dataset)} frames to {path}.")
         return 0
 
@@ -127,12 +126,6 @@ class Submit:
             return 1
         print(f"Wrote {self.out} with {write_submission(self.results, self.out)} files.")
         return 0
-
-
-def _progress(items: Sequence[Item]) -> Iterable[Item]:
-    from tqdm.auto import tqdm
-
-    return tqdm(items, unit="frame", leave=False, disable=None)
 
 
 def _listing(findings: Sequence[Finding], most: int) -> list[str]:

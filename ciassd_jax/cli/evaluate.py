@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,8 +29,8 @@ class Text:
     """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
 
     def run(self) -> int:
-        from ciassd_jax.evaluation import evaluate, read_folders
-        from ciassd_jax.formats.writing import check_folder
+        from ciassd_jax.evaluation import evaluate, format_json, format_report, read_folders
+        from ciassd_jax.formats.writing import check_folder, write_text
 
         if self.json is not None:
             check_folder(self.json.parent)
@@ -39,8 +38,8 @@ class Text:
             truths, detections = read_folders(self.labels, self.results)
         evaluation = evaluate(truths, detections)
         if self.json is not None:
-            _write(self.json, _json(evaluation))
-        print(_text(evaluation))
+            write_text(self.json, format_json(evaluation))
+        print(format_report(evaluation))
         if self.json is not None:
             print(f"Wrote {self.json}.")
         return 0
@@ -87,6 +86,7 @@ class Evaluate:
     def _network(self) -> int:
         from ciassd_jax.data.folders import find_root, open_dataset
         from ciassd_jax.detector import Detector
+        from ciassd_jax.evaluation import format_report
         from ciassd_jax.formats.writing import check_folder
         from ciassd_jax.scoring import detect_dataset, score_frames
 
@@ -100,7 +100,7 @@ class Evaluate:
             dataset = open_dataset(root, self.split, self.image_size)
             frames = detect_dataset(Detector(weights.variables, config), dataset, _progress)
         evaluation = score_frames(frames)
-        print(_text(evaluation))
+        print(format_report(evaluation))
         boxes, seconds = sum(len(frame.lines) for frame in frames), sum(frame.result.seconds for frame in frames)
         milliseconds = f"{1e3 * seconds / len(frames):.0f} ms a frame"
         print(f"\n{len(frames)} frames, {boxes} boxes, {milliseconds} without reading and compilation.")
@@ -119,15 +119,17 @@ class Evaluate:
         )
 
     def _write(self, frames: Sequence[ScoredFrame], evaluation: Evaluation) -> None:
+        from ciassd_jax.evaluation import format_json, format_report
+        from ciassd_jax.formats.writing import write_text
         from ciassd_jax.scoring import write_frames
 
         if self.out is not None:
             write_frames(frames, self.out)
-            _write(self.out / "result.json", _json(evaluation))
+            write_text(self.out / "result.json", format_json(evaluation))
             # A .txt would be a frame to whatever reads the folder.
-            _write(self.out / "table.log", _text(evaluation))
+            write_text(self.out / "table.log", format_report(evaluation))
         if self.json is not None:
-            _write(self.json, _json(evaluation))
+            write_text(self.json, format_json(evaluation))
         written = [str(path) for path in (self.out, self.json) if path is not None]
         if written:
             print(f"Wrote {' and '.join(written)}.")
@@ -136,23 +138,4 @@ class Evaluate:
 def _progress(names: Sequence[str]) -> Iterable[str]:
     from tqdm.auto import tqdm
 
-    return tqdm(names, unit="frame", disable=None)
-
-
-def _text(evaluation: Evaluation) -> str:
-    from ciassd_jax.evaluation import format_block, format_tables
-
-    return f"{format_block(evaluation)}\n\n{format_tables(evaluation)}".strip()
-
-
-def _json(evaluation: Evaluation) -> str:
-    from ciassd_jax.evaluation import to_json
-
-    return json.dumps(to_json(evaluation), indent=1, allow_nan=False)
-
-
-def _write(path: Path, text: str) -> None:
-    from ciassd_jax.formats.writing import replacing
-
-    with replacing(path) as temporary:
-        temporary.write_text(f"{text}\n", encoding="utf-8")
+    return tqdm(names, unit="frame")

@@ -73,7 +73,7 @@ class Predict:
         from tqdm.auto import tqdm
 
         boxes, seconds = 0, 0.0
-        with tqdm(frames, unit="frame", disable=None) as bar:
+        with tqdm(frames, unit="frame") as bar:
             for frame in bar:
                 result, _ = self._frame(detector, frame)
                 best = f"best {result.scores.max():.2f}" if len(result) else "none"

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from ciassd_jax.formats.errors import FormatWarning
+
+Item = TypeVar("Item")
 
 
 class UsageError(ValueError):
@@ -35,3 +38,10 @@ def warnings_as_lines(source: Path | str) -> Iterator[None]:
         warnings.simplefilter("always", FormatWarning)
         warnings.showwarning = show
         yield
+
+
+def frames_with_bar(items: Sequence[Item]) -> Iterable[Item]:
+    """The items, with a progress bar where a terminal shows it."""
+    from tqdm.auto import tqdm
+
+    return tqdm(items, unit="frame", leave=False, disable=None)

@@ -7,15 +7,15 @@ import logging
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 from ciassd_jax.cli.inference import Preset
-from ciassd_jax.cli.messages import UsageError, warnings_as_lines
+from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
 from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.presets import PRESETS
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from ciassd_jax.fitting import Intervals
     from ciassd_jax.types import Variables
 
-Item = TypeVar("Item")
 # Options that replace a field of the config's schedule.
 _SCHEDULE = ("batch_size", "kind", "learning_rate", "weight_decay", "accumulate", "ema_decay", "rematerialize")
 # One frame is learnt by heart so; the running statistics of the batch norms need the last hundreds of steps to settle.
@@ -200,7 +199,7 @@ class Train:
         if self.overfit_one is not None or not pasted:
             return None
         places = [database_path(folder, self.split) for folder in (root, self.workdir)]
-        find = partial(find_database, dataset, places, _progress, say)
+        find = partial(find_database, dataset, places, frames_with_bar, say)
         # The others open what the first one may have to build.
         return on_first(find) or find()
 
@@ -254,9 +253,3 @@ def _refused_as_usage() -> Iterator[None]:
         yield
     except ValueError as error:
         raise UsageError(str(error)) from error
-
-
-def _progress(items: Sequence[Item]) -> Iterable[Item]:
-    from tqdm.auto import tqdm
-
-    return tqdm(items, unit="frame", leave=False, disable=None)

@@ -2,7 +2,7 @@
 
 from ciassd_jax.evaluation.folders import read_folders
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
-from ciassd_jax.evaluation.report import format_block, format_tables, to_json
+from ciassd_jax.evaluation.report import format_block, format_json, format_report, format_tables, to_json
 from ciassd_jax.evaluation.summary import Evaluation, evaluate
 
 __all__ = [
@@ -12,6 +12,8 @@ __all__ = [
     "detections_from_rows",
     "evaluate",
     "format_block",
+    "format_json",
+    "format_report",
     "format_tables",
     "labels_from_rows",
     "read_folders",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
 
@@ -47,6 +48,16 @@ def format_block(evaluation: Evaluation) -> str:
                 lines.append(f"{name} {title}@{limits[0]:.2f}, {limit:.2f}, {limit:.2f}:")
                 lines += _block_lines(evaluation, name, limit, recall)
     return "\n".join(lines)
+
+
+def format_report(evaluation: Evaluation) -> str:
+    """The official program's block and our tables."""
+    return f"{format_block(evaluation)}\n\n{format_tables(evaluation)}".strip()
+
+
+def format_json(evaluation: Evaluation) -> str:
+    """`to_json` as text."""
+    return json.dumps(to_json(evaluation), indent=1, allow_nan=False)
 
 
 def format_tables(evaluation: Evaluation) -> str:

@@ -38,3 +38,9 @@ def replacing(path: Pathlike) -> Iterator[Path]:
         # Below a file even the removal of nothing is an error.
         if temporary.exists():
             temporary.unlink()
+
+
+def write_text(path: Pathlike, text: str) -> None:
+    """Write a file of text with a line end, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(f"{text}\n", encoding="utf-8")
