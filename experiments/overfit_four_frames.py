@@ -27,11 +27,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--workdir", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--steps", type=int, default=1000)
     options = parser.parse_args()
 
     config = car_lite()
-    config = replace(config, schedule=replace(config.schedule, total_steps=options.steps, learning_rate=2e-3))
+    config = replace(config, schedule=replace(config.schedule, total_steps=options.steps, learning_rate=1e-3))
     dataset = replace(open_dataset(options.data, "all"), names=FRAMES)
     batches = make_batches(dataset, config, seed=0, batch_size=len(FRAMES), augmented=False)
     start = time.perf_counter()

@@ -68,15 +68,20 @@ def _forward(x: Array, real: Array | None, scale: Array, bias: Array, epsilon: f
 
 def _backward(epsilon: float, axis_name: str | None, saved: tuple, gradients: tuple):  # type: ignore[no-untyped-def]
     x, real, scale, mean, variance, count = saved
-    gradient, centred = _wide(gradients[0]), _wide(x) - _row(mean, x)
     inverse = lax.rsqrt(variance + epsilon)
-    to_bias, along = gradient.sum(_axes(x)), (gradient * centred).sum(_axes(x))
+    # Passes over x are cheap and maps of its size are not: without the barriers XLA would keep x - mean from the forward
+    # pass, and the gradient behind a ReLU from one pass to the next.
+    x, mean = lax.optimization_barrier((x, mean))
+    gradient = gradients[0]
+    to_bias = _wide(gradient).sum(_axes(x))
+    along = (_wide(gradient) * (_wide(x) - _row(mean, x))).sum(_axes(x))
     pooled_bias, pooled_along = _pooled((to_bias, along), axis_name)
     # All entries move mean and variance, whatever device reads them.
     entries = jnp.maximum(count, 1)
     drift, slope = pooled_bias / entries, pooled_along * inverse**2 / entries
-    moved = _real(_row(drift, x) + centred * _row(slope, x), real)
-    to_x = (gradient - moved) * _row(scale * inverse, x)
+    gradient, x, mean = lax.optimization_barrier((gradient, x, mean))
+    moved = _real(_row(drift, x) + (_wide(x) - _row(mean, x)) * _row(slope, x), real)
+    to_x = (_wide(gradient) - moved) * _row(scale * inverse, x)
     return to_x.astype(x.dtype), None, along * inverse, to_bias
 
 
