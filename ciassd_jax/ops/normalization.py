@@ -69,8 +69,8 @@ def _forward(x: Array, real: Array | None, scale: Array, bias: Array, epsilon: f
 def _backward(epsilon: float, axis_name: str | None, saved: tuple, gradients: tuple):  # type: ignore[no-untyped-def]
     x, real, scale, mean, variance, count = saved
     inverse = lax.rsqrt(variance + epsilon)
-    # Passes over x are cheap and maps of its size are not: without the barriers XLA would keep x - mean from the forward
-    # pass, and the gradient behind a ReLU from one pass to the next.
+    # Passes over x are cheap and maps of its size are not: without the barriers XLA would keep x - mean from the
+    # forward pass, and the gradient behind a ReLU from one pass to the next.
     x, mean = lax.optimization_barrier((x, mean))
     gradient = gradients[0]
     to_bias = _wide(gradient).sum(_axes(x))
