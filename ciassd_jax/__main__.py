@@ -1,7 +1,21 @@
-"""`python -m ciassd_jax` is the program `ciassd`."""
+"""`python -m ciassd_jax` is the program `ciassd`, which finds what it compiled in its next run again."""
 
+import os
 import sys
+from pathlib import Path
+
+import jax
 
 from ciassd_jax.cli import main
 
-sys.exit(main())
+
+def program() -> int:
+    """Run the program; JAX_COMPILATION_CACHE_DIR moves what it keeps, JAX_ENABLE_COMPILATION_CACHE=false keeps none."""
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(cache / "ciassd_jax"))
+    return main()
+
+
+if __name__ == "__main__":
+    sys.exit(program())

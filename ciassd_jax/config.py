@@ -124,14 +124,22 @@ class BackboneConfig:
 
 @dataclass(frozen=True)
 class NeckConfig:
-    """SSFA (paper section 3.2, SPEC section 5). The semantic branch has twice the spatial channels."""
+    """From the BEV map to the head's features.
 
+    "ssfa" is the paper's (section 3.2, SPEC section 5), whose semantic branch has twice the spatial channels. Table 4
+    compares it with the others: "second" has seven 3 x 3 convolutions, "sassd" seven of twice the channels and one of
+    1 x 1.
+    """
+
+    kind: Literal["ssfa", "second", "sassd"] = "ssfa"
     channels: int = 128
     attention_kernel: Literal[1, 3] = 3
 
     def __post_init__(self) -> None:
         if self.channels < 1 or self.attention_kernel not in (1, 3):
             raise ValueError(f"neck {self}: channels must be at least 1 and attention_kernel 1 or 3.")
+        if self.kind not in ("ssfa", "second", "sassd"):
+            raise ValueError(f"neck.kind: {self.kind!r} is unknown; choose 'ssfa', 'second' or 'sassd'.")
 
 
 @dataclass(frozen=True)
@@ -171,6 +179,8 @@ class HeadConfig:
     """Multi-task head (paper section 3.3, SPEC section 6); `angles` are the anchors' r in radians."""
 
     angles: tuple[float, ...] = (0.0, math.pi / 2)
+    # Without the IoU branch every box counts as a perfect one: the confidence is the class probability.
+    predict_iou: bool = True
     iou_kernel: Literal[1, 3] = 1
     iou_bias: bool = True
 

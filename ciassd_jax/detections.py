@@ -34,7 +34,9 @@ def select_candidates(
     Returns the `max_candidates` of best rectified confidence, best first, and how many more there were.
     """
     probability = jax.nn.sigmoid(predictions.class_logit)
-    score, quality = rectify(probability, predictions.iou, config)
+    # Without an IoU branch every box counts as perfect.
+    raw_iou = jnp.ones_like(probability) if predictions.iou is None else predictions.iou
+    score, quality = rectify(probability, raw_iou, config)
     passes = probability >= config.score_threshold
     capacity = min(config.max_candidates, passes.shape[0])
     # What is no number could not be ranked: it is counted with the dropped.

@@ -76,16 +76,23 @@ def scene_loss(predictions: Predictions, targets: Targets, anchors: Boxes, confi
     """The terms of one scene: sums over its anchors, divided by the number of positive ones or 1 if there are none."""
     positive = targets.label == 1
     sigma = config.smooth_l1_sigma
-    overlap = detached_overlap(predictions.box, targets.box, anchors)
     pieces = (
         classification_loss(predictions.class_logit, targets.label, alpha=config.focal_alpha, gamma=config.focal_gamma),
         box_loss(predictions.box, targets.box, positive, sigma=sigma),
         direction_loss(predictions.direction, targets.direction, positive),
-        iou_loss(predictions.iou, overlap, positive, sigma=sigma),
+        _iou_piece(predictions, targets, anchors, config),
     )
     classification, box, direction, iou = (piece.sum() / jnp.maximum(positive.sum(), 1) for piece in pieces)
     total = classification + config.box_weight * box + config.direction_weight * direction + config.iou_weight * iou
     return LossTerms(classification, box, direction, iou, total)
+
+
+def _iou_piece(predictions: Predictions, targets: Targets, anchors: Boxes, config: LossConfig) -> Array:
+    """`iou_loss` of every anchor, or zeros where the network has no IoU branch."""
+    if predictions.iou is None:
+        return jnp.zeros(targets.label.shape)
+    overlap = detached_overlap(predictions.box, targets.box, anchors)
+    return iou_loss(predictions.iou, overlap, targets.label == 1, sigma=config.smooth_l1_sigma)
 
 
 def scene_losses(predictions: Predictions, targets: Targets, anchors: Boxes, config: LossConfig) -> LossTerms:

@@ -139,13 +139,13 @@ class Predictions(NamedTuple):
     """What the network says of every anchor, before any decoding.
 
     `box` holds the residuals in the paper's order (x, y, z, w, l, h, r), `class_logit` the logit of the
-    anchor's own class, `direction` two logits, `iou` the raw IoU output in about [-1, 1].
+    anchor's own class, `direction` two logits, `iou` the raw IoU output in about [-1, 1], None without that branch.
     """
 
     box: Float[Array, "*b A 7"]
     class_logit: Float[Array, "*b A"]
     direction: Float[Array, "*b A 2"]
-    iou: Float[Array, "*b A"]
+    iou: Float[Array, "*b A"] | None
 
 
 class Targets(NamedTuple):

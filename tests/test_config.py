@@ -76,8 +76,10 @@ def test_the_paper_preset():
     assert config.class_names == ("Car",)
     expected = {
         "grid.overflow": "skip",
+        "neck.kind": "ssfa",
         "neck.attention_kernel": 3,
         "head.angles": (0.0, math.pi / 2),
+        "head.predict_iou": True,
         "head.iou_kernel": 1,
         "head.iou_bias": True,
         "classes[0].support_threshold": 2.6,
@@ -173,7 +175,7 @@ def edited(path: str, value: object) -> str:
         ("neck.width", 1, r"config\.neck: .*unknown \['width'\], missing \[\]"),
         ("neck.channels", ..., r"config\.neck: .*unknown \[\], missing \['channels'\]"),
         ("detection", ..., r"config: .*missing \['detection'\]"),
-        ("neck", 3, r"config\.neck: expected the fields \['attention_kernel', 'channels'\]"),
+        ("neck", 3, r"config\.neck: expected the fields \['attention_kernel', 'channels', 'kind'\]"),
         ("neck", None, r"config\.neck: expected the fields"),
         ("neck.channels", "128", r"config\.neck\.channels: expected int, not '128'"),
         ("neck.channels", 128.0, r"config\.neck\.channels: expected int, not 128\.0"),
@@ -251,6 +253,7 @@ def no_type_checks():
         (StageConfig, {"channels": 1, "layers": 1, "capacity": 1, "z_padding": 2}, "backbone stage .*z_padding 0 or 1"),
         (BackboneConfig, {"stages": ()}, "backbone: at least one stage"),
         (BackboneConfig, {"backend": "cuda"}, "backbone: backend 'cuda' is unknown; choose 'gather' or 'dense'"),
+        (NeckConfig, {"kind": "fpn"}, "neck.kind: 'fpn' is unknown; choose 'ssfa', 'second' or 'sassd'"),
         (NeckConfig, {"channels": 0}, "neck .*channels must be at least 1"),
         (NeckConfig, {"attention_kernel": 2}, "neck .*attention_kernel 1 or 3"),
         (ClassConfig, {"name": "Bus", "width": 0.0}, "class Bus: width, length and height must be positive"),

@@ -12,7 +12,7 @@ from jaxtyping import Array, Int
 from ciassd_jax.config import Config
 from ciassd_jax.model.backbone import SPConvNet
 from ciassd_jax.model.head import MultiTaskHead
-from ciassd_jax.model.neck import SSFA
+from ciassd_jax.model.neck import SSFA, ConvolutionStack
 from ciassd_jax.types import Predictions, SparseVoxels
 
 
@@ -30,7 +30,8 @@ class CIASSD(nn.Module):
         config, dtype = self.config, jnp.dtype(self.config.dtype)
         backbone = SPConvNet(config.backbone, config.grid.shape, dtype, self.axis_name, name="backbone")
         bev, kept, dropped = backbone(voxels, train=train)
-        features = SSFA(config.neck, dtype, self.axis_name, name="neck")(bev, train=train)
+        neck = SSFA if config.neck.kind == "ssfa" else ConvolutionStack
+        features = neck(config.neck, dtype, self.axis_name, name="neck")(bev, train=train)
         head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, name="head")
         return head(features), kept, dropped
 

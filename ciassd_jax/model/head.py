@@ -34,7 +34,7 @@ class Branch(nn.Module):
 
 
 class MultiTaskHead(nn.Module):
-    """Four branches on the same features, flattened to one row per anchor (y, x, then anchor of the cell)."""
+    """Four branches on the same features, or three, flattened to one row per anchor (y, x, then anchor of the cell)."""
 
     config: HeadConfig
     anchors_per_cell: int
@@ -46,10 +46,13 @@ class MultiTaskHead(nn.Module):
         box = Branch(7 * anchors, 1, True, self.dtype, name="box")(x)
         class_logit = Branch(anchors, 1, True, self.dtype, name="class")(x)
         direction = Branch(2 * anchors, 1, True, self.dtype, name="direction")(x)
-        iou = Branch(anchors, self.config.iou_kernel, self.config.iou_bias, self.dtype, name="iou")(x)
+        iou = None
+        if self.config.predict_iou:
+            iou = Branch(anchors, self.config.iou_kernel, self.config.iou_bias, self.dtype, name="iou")(x)
+            iou = iou.reshape(batch, -1)
         return Predictions(
             box=box.reshape(batch, -1, 7),
             class_logit=class_logit.reshape(batch, -1),
             direction=direction.reshape(batch, -1, 2),
-            iou=iou.reshape(batch, -1),
+            iou=iou,
         )

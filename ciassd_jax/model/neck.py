@@ -1,4 +1,4 @@
-"""SSFA: Spatial-Semantic Feature Aggregation (paper section 3.2 and Figure 3, SPEC section 5)."""
+"""SSFA: Spatial-Semantic Feature Aggregation (paper section 3.2 and Figure 3, SPEC section 5), and its rivals."""
 
 from __future__ import annotations
 
@@ -50,6 +50,23 @@ class SSFA(nn.Module):
         )
         weight = jax.nn.softmax(logits.astype(jnp.float32), -1).astype(self.dtype)
         return enriched * _spread(weight[..., :1], width) + raised * _spread(weight[..., 1:], width)
+
+
+class ConvolutionStack(nn.Module):
+    """The necks of SECOND and SA-SSD, which Table 4 compares with: convolutions of one resolution in a row."""
+
+    config: NeckConfig
+    dtype: jnp.dtype
+    axis_name: str | None = None
+
+    @nn.compact
+    def __call__(self, bev: Float[Array, "B H W C"], *, train: bool) -> Float[Array, "B H W D"]:
+        width = self.config.channels
+        layers = [(width, 3)] * 7 if self.config.kind == "second" else [(2 * width, 3)] * 7 + [(2 * width, 1)]
+        for i, (channels, kernel_size) in enumerate(layers):
+            layer = ConvNormRelu(channels, kernel_size, self.dtype, axis_name=self.axis_name, name=f"conv_{i}")
+            bev = layer(bev, train=train)
+        return bev
 
 
 def _spread(weight: Float[Array, "B H W 1"], channels: int) -> Float[Array, "B H W C"]:
