@@ -1,4 +1,4 @@
-"""Commands around a data set: data check, data prepare, submit."""
+"""Commands around a data set: data check, data prepare, data synth, submit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ciassd_jax.cli.inference import Preset
-from ciassd_jax.cli.messages import frames_with_bar, warnings_as_lines
+from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.presets import PRESETS
 
@@ -87,12 +87,42 @@ class Prepare:
 
 
 @dataclass(frozen=True)
+class Synth:
+    """Write synthetic LiDAR scenes as a folder in KITTI's layout; every fourth frame is of the split val."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """The folder; new or empty, unless with --overwrite."""
+    frames: int = 100
+    """How many frames to write."""
+    seed: int = 0
+    """Frame i depends on the seed and i alone."""
+    overwrite: bool = False
+    """Replace what an earlier `data synth` wrote there."""
+
+    def run(self) -> int:
+        from ciassd_jax.data.synthetic import write_synthetic
+
+        if self.frames < 1:
+            raise UsageError(f"--frames {self.frames} makes no data set; ask for at least 1.")
+        if not 0 <= self.seed < 2**31:
+            raise UsageError(f"--seed {self.seed} is outside 0..{2**31 - 1}; choose one inside.")
+        dropped = write_synthetic(
+            self.out, frames=self.frames, seed=self.seed, overwrite=self.overwrite, track=frames_with_bar
+        )
+        if dropped:
+            print(f"Pairs of a far solid and a tile of rays over capacity, and not seen: {dropped}.")
+        print(f"Wrote {self.frames} frames to {self.out}.")
+        return 0
+
+
+@dataclass(frozen=True)
 class Data:
-    """Check and prepare a data set."""
+    """Check, prepare or make up a data set."""
 
     action: Annotated[
         Annotated[Check, tyro.conf.subcommand("check", prefix_name=False)]
-        | Annotated[Prepare, tyro.conf.subcommand("prepare", prefix_name=False)],
+        | Annotated[Prepare, tyro.conf.subcommand("prepare", prefix_name=False)]
+        | Annotated[Synth, tyro.conf.subcommand("synth", prefix_name=False)],
         tyro.conf.arg(name=""),
     ]
 
