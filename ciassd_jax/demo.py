@@ -1,58 +1,68 @@
-"""`ciassd demo`: the pipeline on one scene, from points to a picture."""
+"""`ciassd demo`: from points to pictures, on simulated streets or on a cloud of the user's."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import jax
-import numpy as np
-
-from ciassd_jax.detector import BUNDLED, Detector, FrameResult
+from ciassd_jax.data.synthetic import open_synthetic
+from ciassd_jax.detector import Detector
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.formats.writing import check_folder, replacing
-from ciassd_jax.model.detector import init_variables
 from ciassd_jax.predict_files import write_json
-from ciassd_jax.presets import car_lite
+from ciassd_jax.view.frames import ViewFrame, frame_to_view, with_result
 from ciassd_jax.weights import Weights
 
-UNTRAINED = """No trained weights are bundled yet, so this network is UNTRAINED: its boxes mean nothing.
-It shows the pipeline only, from points to results; give trained weights with --weights."""
 
-
-def run_demo(file: Path | None, weights: Weights | None, out: Path) -> None:
-    """Detect in `file`, or in the bundled synthetic scene, print the result and write JSON and a picture to `out`."""
+def run_demo(file: Path | None, weights: Weights, out: Path, *, scenes: int, seed: int) -> None:
+    """Detect in `file`, or in so many simulated scenes; print what is found, write JSON and pictures to `out`."""
     check_folder(out)
-    if weights is None:
-        print(UNTRAINED)
-    points, truth = _scene() if file is None else (read_points(file), None)
-    name = "scene" if file is None else file.stem
-    source = "a synthetic scene" if file is None else str(file)
-    print(f"Detecting in {source} of {len(points)} points; the compiler needs a moment.", flush=True)
-    if weights is None:
-        config = car_lite()
-        weights = Weights(init_variables(jax.random.key(0), config), config, [])
-    result = Detector(weights.variables, weights.config).detect(points)
-    print(result)
-    written = [write_json(out / f"{name}.json", result)]
-    title = f"ciassd demo: {source}" + ("" if weights.report else ", untrained weights")
-    written += _picture(out / f"{name}.png", points, truth, result, title)
-    print(f"Wrote {' and '.join(map(str, written))}.")
+    frames = [ViewFrame(file.stem, read_points(file))] if file is not None else simulated_frames(scenes, seed)
+    detector = Detector(weights.variables, weights.config)
+    print("Compiling the detector; what is compiled once is kept for the next run.", flush=True)
+    detector.compile(max(len(frame.points) for frame in frames))
+    shown, written = [], []
+    for frame in frames:
+        result = detector.detect(frame.points)
+        cars = f", {len(frame.truth)} objects in its label" if file is None else ""
+        print(f"\n{frame.name}: {len(frame.points)} points{cars}\n{result}", flush=True)
+        shown.append(with_result(frame, result))
+        written.append(write_json(out / f"{frame.name}.json", result))
+    print()
+    for draw in (_pictures, _page):
+        written += _drawn(draw, shown, out)
+    print("Wrote " + ", ".join(map(str, written)) + ".")
 
 
-def _scene() -> tuple[np.ndarray, np.ndarray]:
-    """Points and true cars of the bundled scene."""
-    with np.load(BUNDLED / "scene.npz") as scene:
-        return scene["points"], scene["boxes"]
+def simulated_frames(number: int, seed: int) -> list[ViewFrame]:
+    """Scenes with their ground truth, as the camera's view shows them."""
+    print(f"Simulating {number} streets as a LiDAR with 64 beams sees them.", flush=True)
+    dataset = open_synthetic(seed, number)
+    return [frame_to_view(dataset.read(index))._replace(name=f"street_{index}") for index in range(number)]
 
 
-def _picture(path: Path, points: np.ndarray, truth: np.ndarray | None, result: FrameResult, title: str) -> list[Path]:
-    """Draw the scene where matplotlib is installed; the path, or nothing and a sentence that says what is missing."""
+def _drawn(draw: Callable[[Sequence[ViewFrame], Path], list[Path]], frames: list[ViewFrame], out: Path) -> list[Path]:
+    """What was drawn; nothing, and a sentence that says what is missing, without the extra for pictures."""
     try:
-        from ciassd_jax.view.bev import plot_bev
+        return draw(frames, out)
     except ModuleNotFoundError as error:
         print(error)
         return []
-    figure = plot_bev(points, result.boxes, truth, result.scores, result.labels, title=title)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png")
-    return [path]
+
+
+def _pictures(frames: Sequence[ViewFrame], out: Path) -> list[Path]:
+    from ciassd_jax.view.bev import plot_bev
+
+    paths = [out / f"{frame.name}.png" for frame in frames]
+    for frame, path in zip(frames, paths, strict=True):
+        truth = frame.truth if len(frame.truth) else None
+        figure = plot_bev(frame.points, frame.boxes, truth, frame.scores, frame.labels, title=frame.name)
+        with replacing(path) as temporary:
+            figure.savefig(temporary, format="png")
+    return paths
+
+
+def _page(frames: Sequence[ViewFrame], out: Path) -> list[Path]:
+    from ciassd_jax.view.html import view_html
+
+    return [view_html(frames, title="ciassd demo").save(out / "view.html")]

@@ -21,7 +21,8 @@ from ciassd_jax.types import Array, Counts, PointCloud, Variables
 from ciassd_jax.weights import load_weights
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from ciassd_jax.view.bev import Picture
+    from ciassd_jax.view.html import Page
 
 BUNDLED = Path(__file__).parent / "bundled"
 # Half-spaces that hold every point: no camera, no frustum.
@@ -61,11 +62,20 @@ class FrameResult:
         more = [f"  ... and {len(self) - 10} more"] if len(self) > 10 else []
         return "\n".join([head, *rows, *more])
 
-    def plot_bev(self, points: np.ndarray) -> Figure:
-        """Bird's-eye view of the points [N, 4] and these boxes, as a matplotlib figure."""
+    def plot_bev(self, points: np.ndarray, truth: np.ndarray | None = None) -> Picture:
+        """Bird's-eye view of points [N, 4], these and true boxes [G, 7]: a matplotlib figure that notebooks show."""
         from ciassd_jax.view.bev import plot_bev
 
-        return plot_bev(points, boxes=self.boxes, scores=self.scores)
+        return plot_bev(np.asarray(points), self.boxes, truth, self.scores, self.labels)
+
+    def view(self, points: np.ndarray, truth: np.ndarray | None = None, *, name: str = "points") -> Page:
+        """These boxes, the points [N, 4] and true boxes [G, 7] in 3D: a page; notebooks show it, `.save(path)`."""
+        from ciassd_jax.view.frames import NO_BOXES, ViewFrame
+        from ciassd_jax.view.html import view_html
+
+        true_boxes = NO_BOXES if truth is None else np.asarray(truth)
+        frame = ViewFrame(name, np.asarray(points), self.boxes, self.scores, self.labels, true_boxes)
+        return view_html([frame], title=name)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, strings and lists, ready for JSON."""

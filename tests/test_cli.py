@@ -12,6 +12,7 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -24,10 +25,13 @@ from small import CALIBRATION, IMAGE_SIZE, random_variables, share_programs, sma
 from ciassd_jax import Detector, load_weights, save_weights, tiny
 from ciassd_jax.cli import main
 from ciassd_jax.cli.inference import Preset
+from ciassd_jax.data.synthetic import Lidar, open_synthetic
 from ciassd_jax.detector import FrameResult
 from ciassd_jax.formats.kitti import read_rows
 from ciassd_jax.formats.points import write_bin
 from ciassd_jax.presets import PRESETS
+
+SMALL_LIDAR = Lidar(upper=(2.0, -8.0, 8), lower=(-9.0, -24.0, 8), columns=256)
 
 
 class Run(NamedTuple):
@@ -445,42 +449,39 @@ def test_info_of_a_preset_needs_no_weights(run: Any, monkeypatch: Any) -> None:
     assert facts["config"] == json.loads(tiny().to_json())
 
 
-@pytest.fixture
-def small_demo(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ciassd_jax.demo.car_lite", small_config)
-    monkeypatch.setattr("ciassd_jax.demo.init_variables", lambda key, config: random_variables(config))
-
-
-@pytest.mark.usefixtures("small_demo")
-def test_demo_says_that_it_is_untrained_and_shows_the_pipeline(run: Any, tmp_path: Path, monkeypatch: Any) -> None:
+def test_demo_detects_in_simulated_streets(run: Any, weights: Path, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
-    result = run("demo")
+    monkeypatch.setattr("ciassd_jax.demo.open_synthetic", partial(open_synthetic, lidar=SMALL_LIDAR))
+    result = run("demo", "--weights", weights, "--scenes", "2", "--seed", "3")
     assert result.code == 0
-    assert "UNTRAINED: its boxes mean nothing" in result.out.splitlines()[0]
-    assert "shows the pipeline only" in result.out.splitlines()[1]
-    assert "synthetic" in result.out
-    assert files(tmp_path / "ciassd_demo") == ["scene.json", "scene.png"]
-    assert result.out.splitlines()[-1] == "Wrote ciassd_demo/scene.json and ciassd_demo/scene.png."
-    assert re.match("warning: .*scene: Dropped ", result.err)
+    assert len(re.findall(r"^street_\d: \d+ points, \d+ objects in its label\n\d+ detections", result.out, re.M)) == 2
+    names = ["street_0.json", "street_0.png", "street_1.json", "street_1.png", "view.html"]
+    assert files(tmp_path / "ciassd_demo") == names
+    last = result.out.splitlines()[-1]
+    assert all(f"ciassd_demo/{name}" in last for name in names)
 
 
-@pytest.mark.usefixtures("small_demo")
 def test_demo_of_a_file_and_weights_of_your_own(run: Any, weights: Path, tmp_path: Path) -> None:
     write_bin(tmp_path / "street.bin", small_cloud())
     result = run("demo", tmp_path / "street.bin", "--weights", weights, "--out", tmp_path / "out")
     assert (result.code, result.err) == (0, "")
-    assert "UNTRAINED" not in result.out
-    assert files(tmp_path / "out") == ["street.json", "street.png"]
+    assert "label" not in result.out
+    assert files(tmp_path / "out") == ["street.json", "street.png", "view.html"]
 
 
-@pytest.mark.usefixtures("small_demo")
-def test_demo_without_matplotlib_names_the_extra(run: Any, tmp_path: Path, monkeypatch: Any) -> None:
+def test_demo_of_no_scenes_is_refused(run: Any) -> None:
+    result = run("demo", "--scenes", "0")
+    assert (result.code, result.err) == (2, "error: --scenes 0 shows nothing; ask for at least 1.\n")
+
+
+def test_demo_without_pictures_names_the_extra(run: Any, weights: Path, tmp_path: Path, monkeypatch: Any) -> None:
     write_bin(tmp_path / "street.bin", small_cloud())
-    monkeypatch.delitem(sys.modules, "ciassd_jax.view.bev", raising=False)
-    monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
-    result = run("demo", tmp_path / "street.bin", "--out", tmp_path / "out")
+    for module, library in (("bev", "matplotlib.axes"), ("html", "plotly.offline")):
+        monkeypatch.delitem(sys.modules, f"ciassd_jax.view.{module}", raising=False)
+        monkeypatch.setitem(sys.modules, library, None)
+    result = run("demo", tmp_path / "street.bin", "--weights", weights, "--out", tmp_path / "out")
     assert result.code == 0
-    assert "pip install 'ciassd_jax[viz]'" in result.out
+    assert result.out.count("pip install 'ciassd_jax[viz]'") == 2
     assert files(tmp_path / "out") == ["street.json"]
 
 

@@ -1,4 +1,4 @@
-"""`ciassd data check`, `ciassd data prepare` and `ciassd submit`: exit codes, and what they print and write."""
+"""`ciassd data check`, `data prepare`, `data synth` and `submit`: exit codes, and what they print and write."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +13,7 @@ from ciassd_jax.cli import main
 from ciassd_jax.data.check import check_dataset
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.paste import fingerprint_of, open_database
+from ciassd_jax.data.synthetic import Lidar
 from ciassd_jax.formats.kitti import read_rows, write_rows
 from ciassd_jax.formats.points import write_bin
 
@@ -131,6 +132,36 @@ def test_prepare_cannot_reduce_without_a_camera(run: Any, tmp_path: Path) -> Non
     result = run("data", "prepare", write_custom(tmp_path), "--reduce")
     assert result.code == 2
     assert result.err == f"error: {tmp_path} has no camera to crop clouds to; leave out --reduce.\n"
+
+
+def test_synth_writes_a_folder_that_passes_the_check(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fewer columns than the real sensor has: the test is of the command.
+    monkeypatch.setattr("ciassd_jax.data.synthetic.simulation.Lidar", lambda: Lidar(columns=512))
+    root = tmp_path / "synth"
+    result = run("data", "synth", root, "--frames", 4, "--seed", 1)
+    assert (result.code, result.out, result.err) == (0, f"Wrote 4 frames to {root}.\n", "")
+    assert (root / "ImageSets/val.txt").read_text() == "000003\n"
+    assert run("data", "check", root).code == 0
+    again = run("data", "synth", root)
+    assert (again.code, again.out) == (2, "")
+    assert again.err == (
+        f"error: {root} is not empty; name another folder, or replace what is there with --overwrite.\n"
+    )
+    assert run("data", "synth", root, "--frames", 1, "--overwrite").code == 0
+    assert [path.name for path in (root / "training/velodyne").iterdir()] == ["000000.bin"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--frames", 0), "error: --frames 0 makes no data set; ask for at least 1.\n"),
+        (("--seed", -1), "error: --seed -1 is outside 0..2147483647; choose one inside.\n"),
+    ],
+)
+def test_synth_refuses_senseless_numbers(run: Any, tmp_path: Path, options: tuple, message: str) -> None:
+    result = run("data", "synth", tmp_path / "out", *options)
+    assert (result.code, result.out, result.err) == (2, "", message)
+    assert not (tmp_path / "out").exists()
 
 
 def test_submit(run: Any, tmp_path: Path) -> None:

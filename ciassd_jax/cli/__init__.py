@@ -17,6 +17,7 @@ from ciassd_jax.cli.evaluate import Evaluate
 from ciassd_jax.cli.inference import Convert, Demo, Info, Predict
 from ciassd_jax.cli.messages import UsageError
 from ciassd_jax.cli.train import Train
+from ciassd_jax.cli.view import View
 from ciassd_jax.formats.errors import FormatError
 
 Command = (
@@ -25,6 +26,7 @@ Command = (
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[tyro.conf.OmitSubcommandPrefixes[Evaluate], tyro.conf.subcommand("eval")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Submit, tyro.conf.subcommand("submit")]

@@ -158,21 +158,26 @@ class Info:
 
 @dataclass(frozen=True)
 class Demo:
-    """Run the whole pipeline on a synthetic scene, or on your file, and write results and a picture."""
+    """Run the whole pipeline on simulated streets, or on your file, and write results, pictures and a page in 3D."""
 
     file: Annotated[Path | None, tyro.conf.Positional] = None
-    """A cloud of your own instead of the synthetic scene."""
-    weights: Path | None = None
-    """Trained weights; without them the demo says that its network is untrained."""
+    """A cloud of your own instead of simulated ones."""
+    weights: Path = Path("car_lite")
+    """Weights: a file, or the name of bundled ones, which were trained on simulated streets alone."""
     out: Path = Path("ciassd_demo")
     """Folder for the results."""
+    scenes: int = 3
+    """How many streets to simulate."""
+    seed: int = 0
+    """Other seeds, other streets."""
 
     def run(self) -> int:
         from ciassd_jax.demo import run_demo
 
-        with warnings_as_lines(self.file or "synthetic scene"):
-            weights = load_as(self.weights, None) if self.weights else None
-            run_demo(self.file, weights, self.out)
+        if self.scenes < 1:
+            raise UsageError(f"--scenes {self.scenes} shows nothing; ask for at least 1.")
+        with warnings_as_lines(self.file or "simulated street"):
+            run_demo(self.file, load_as(self.weights, None), self.out, scenes=self.scenes, seed=self.seed)
         return 0
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+
+from ciassd_jax.view.sampling import choose_points, usable_boxes
 
 try:
     from matplotlib.axes import Axes
@@ -17,10 +20,21 @@ except ModuleNotFoundError as error:
     raise ModuleNotFoundError("Pictures need matplotlib; get it with `pip install 'ciassd_jax[viz]'`.") from error
 
 TRUTH, FOUND = "#d62728", "#13a538"
+# More points than this only cover each other.
+PICTURE_POINTS = 1_000_000
 # Heights in metres that the colours span: from the ground below the sensor to the roofs of cars and vans.
 HEIGHTS = (-2.0, 1.0)
 # The ground recedes, what stands on it does not; neither is red or green.
 HEIGHT_COLORS = LinearSegmentedColormap.from_list("height", ["#c9c6ba", "#8fa3bd", "#3f6aa8", "#1b2f63"])
+
+
+class Picture(Figure):
+    """A figure that a notebook shows as the value of a cell, whether or not it uses pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        stream = io.BytesIO()
+        self.savefig(stream, format="png")
+        return stream.getvalue()
 
 
 def plot_bev(
@@ -33,17 +47,20 @@ def plot_bev(
     x_limits: tuple[float, float] | None = None,
     y_limits: tuple[float, float] | None = None,
     title: str | None = None,
-) -> Figure:
+) -> Picture:
     """Points coloured by height, ground truth in red, detections in green with score and heading.
 
     `points` hold x, y, z (metres) first; boxes are x, y, z, length, width, height, yaw. Without limits the picture
-    holds every point and box of the front half. Save it with `figure.savefig(path)`.
+    holds every point and box of the front half, and says what it leaves out: points and boxes that are not finite or
+    absurdly far, points beyond a million. Save it with `figure.savefig(path)`.
     """
-    boxes, truth = _boxes(boxes), _boxes(truth)
-    visible = points[np.isfinite(points[:, :3]).all(1)]
+    visible, point_notes = choose_points(points, PICTURE_POINTS)
+    texts = captions_of(0 if boxes is None else len(boxes), scores, labels)
+    boxes, texts, lost = _usable(boxes, texts, "detected")
+    truth, _, lost_truth = _usable(truth, captions_of(0 if truth is None else len(truth), None, None), "true")
     x_limits = x_limits or _span(visible, boxes, truth, 0)
     y_limits = y_limits or _span(visible, boxes, truth, 1)
-    figure = Figure(figsize=_figure_size(x_limits, y_limits), dpi=150, layout="constrained")
+    figure = Picture(figsize=_figure_size(x_limits, y_limits), dpi=150, layout="constrained")
     axes = figure.add_subplot()
     # The highest points last: roofs and walls over the ground.
     visible = visible[np.argsort(visible[:, 2], kind="stable")]
@@ -55,17 +72,27 @@ def plot_bev(
     bar.set_label("height z (m)")
     _draw_boxes(axes, truth, TRUTH, zorder=3)
     _draw_boxes(axes, boxes, FOUND, zorder=4)
-    texts = _captions(len(boxes), scores, labels)
     for box, text in zip(boxes, texts, strict=True):
         _caption(axes, box, text)
     _dress(axes, x_limits, y_limits)
     _legend(axes, len(boxes), len(truth))
     axes.set_title(title or "", loc="left")
+    if notes := [*point_notes, *lost, *lost_truth]:
+        axes.text(0.01, 0.01, "\n".join(notes), transform=axes.transAxes, fontsize=7, color="#555555", zorder=7)
     return figure
 
 
-def _boxes(boxes: np.ndarray | None) -> np.ndarray:
-    return np.zeros((0, 7)) if boxes is None else np.asarray(boxes, np.float64)
+def _usable(
+    boxes: np.ndarray | None, texts: list[str], what: str
+) -> tuple[Float[np.ndarray, "D 7"], list[str], list[str]]:
+    """The boxes that can be drawn, their texts, and a note where some cannot."""
+    if boxes is None:
+        return np.zeros((0, 7)), [], []
+    boxes = np.asarray(boxes, np.float64)
+    usable = np.flatnonzero(usable_boxes(boxes))
+    lost = len(boxes) - len(usable)
+    notes = [f"{lost} of {len(boxes)} {what} boxes are not finite or too far and not shown."] if lost else []
+    return boxes[usable], [texts[index] for index in usable], notes
 
 
 def _footprints(boxes: Float[np.ndarray, "D 7"]) -> Float[np.ndarray, "D 5 2"]:
@@ -89,8 +116,8 @@ def _draw_boxes(axes: Axes, boxes: Float[np.ndarray, "D 7"], color: str, zorder:
         axes.add_collection(LineCollection(list(lines), colors=color, linewidths=1.6, zorder=zorder))
 
 
-def _captions(count: int, scores: np.ndarray | None, labels: Sequence[str] | None) -> list[str]:
-    """Class and score of each box; the class only where there are several."""
+def captions_of(count: int, scores: np.ndarray | None, labels: Sequence[str] | None) -> list[str]:
+    """Class and score of each box as a text; the class only where there are several."""
     several = labels is not None and len(set(labels)) > 1
     parts = [list(labels or []) if several else [], [] if scores is None else [f"{score:.2f}" for score in scores]]
     return [" ".join(part[i] for part in parts if part) for i in range(count)]

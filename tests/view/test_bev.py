@@ -80,6 +80,23 @@ def test_nothing_found_is_a_picture_too(points: np.ndarray, tmp_path) -> None:
     assert legend_of(figure) == ["sensor", "detected (0)"]
 
 
+def test_what_cannot_be_drawn_is_counted_in_the_picture(tmp_path) -> None:
+    points, boxes = POINTS.copy(), BOXES.copy()
+    points[0, 0], points[1, 1], boxes[0, 4] = np.inf, 1e9, np.nan
+    figure = plot_bev(points, boxes, BOXES, np.array([0.9, 0.5], np.float32))
+    assert texts_of(figure) == [
+        "0.50",
+        "1 of 500 points are not finite and not shown.\n1 of 500 points lie farther than 300 m and are not shown.\n"
+        "1 of 2 detected boxes are not finite or too far and not shown.",
+    ]
+    assert legend_of(figure) == ["sensor", "ground truth (2)", "detected (1)"]
+    figure.savefig(tmp_path / "spoilt.png")
+
+
+def test_a_notebook_shows_the_picture() -> None:
+    assert plot_bev(POINTS, BOXES)._repr_png_().startswith(b"\x89PNG")
+
+
 def test_no_pyplot_and_nothing_drawn_on_import() -> None:
     code = "import sys, ciassd_jax; assert 'matplotlib' not in sys.modules; import ciassd_jax.view.bev; "
     code += "assert 'matplotlib.pyplot' not in sys.modules"

@@ -10,7 +10,12 @@ from ciassd_jax.formats.kitti_camera import Camera
 IMAGE_SIZE = (1242, 375)
 _FOCAL, _CENTER = 721.5377, (609.5593, 172.854)
 # Fourth columns of P0..P3: what the cameras' places do to the pixels.
-_SHIFTS = ((0.0, 0.0, 0.0), (-387.5744, 0.0, 0.0), (44.85728, 0.2163791, 0.002745884), (-339.5242, 2.199936, 0.002729905))
+_SHIFTS = (
+    (0.0, 0.0, 0.0),
+    (-387.5744, 0.0, 0.0),
+    (44.85728, 0.2163791, 0.002745884),
+    (-339.5242, 2.199936, 0.002729905),
+)
 _RECTIFICATION = (
     (0.9999239, 0.00983776, -0.007445048),
     (-0.009869795, 0.9999421, -0.004278459),
@@ -30,9 +35,7 @@ _IMU_TO_LIDAR = (
 
 def virtual_camera() -> Camera:
     """The left colour camera."""
-    return Camera(
-        Calibration(_projection(2), np.array(_RECTIFICATION), np.array(_LIDAR_TO_CAMERA)), IMAGE_SIZE
-    )
+    return Camera(Calibration(_projection(2), np.array(_RECTIFICATION), np.array(_LIDAR_TO_CAMERA)), IMAGE_SIZE)
 
 
 def calibration_text() -> str:

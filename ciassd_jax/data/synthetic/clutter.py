@@ -16,6 +16,8 @@ from ciassd_jax.data.synthetic.solids import Solids, block, column, ellipsoid, p
 from ciassd_jax.types import Array
 
 TREE, POLE, HEDGE, WALL, HOUSE, BUSH, CONTAINER = range(7)
+
+
 class _Kind(NamedTuple):
     """Slots on both sides, sizes (length, width, height) from low to high, and how far from the pavement, in metres.
 
@@ -33,9 +35,9 @@ class _Kind(NamedTuple):
 
 _KINDS = (
     _Kind(POLE, 16, (0.1, 0.1, 1.0), (0.3, 0.3, 6.0), -0.9, 0.6, 0.3),
-    _Kind(HOUSE, 16, (6.0, 6.0, 5.0), (22.0, 10.0, 12.0), 1.0, 11.0, 4.0),
+    _Kind(HOUSE, 16, (6.0, 6.0, 5.0), (30.0, 10.0, 12.0), 1.0, 8.0, 4.0),
     _Kind(TREE, 20, (0.2, 0.2, 5.0), (0.7, 0.7, 9.0), -0.6, 0.0, 22.0),
-    _Kind(HEDGE, 12, (3.0, 0.6, 0.8), (16.0, 1.5, 2.2), 0.3, 1.0, 12.0),
+    _Kind(HEDGE, 12, (3.0, 0.6, 0.8), (16.0, 1.5, 2.2), 0.3, 1.0, 9.0),
     _Kind(WALL, 8, (3.0, 0.15, 0.7), (20.0, 0.4, 2.2), 0.3, 1.0, 12.0),
     _Kind(CONTAINER, 8, (0.6, 0.5, 0.9), (5.0, 2.3, 2.4), 0.2, 0.0, 20.0),
     _Kind(BUSH, 20, (0.8, 0.8, 0.6), (3.5, 3.0, 3.0), 0.0, 0.0, 20.0),
@@ -58,13 +60,13 @@ def draw_clutter(chance: Chance, of_kinds: Chance, ground: Ground) -> Slots:
     # The near side of long things is at the distance drawn, trees and poles have their middle there.
     reach = np.array([kind.kind not in (POLE, TREE) for kind in table]) * size[:, 1] / 2
     away = ground.half_width + jnp.maximum(ground.pavement + near + jitter * of_kinds.uniform()[index], 0.3)
-    away = away + far * chance.uniform() ** 1.7 + reach
+    away = away + far * chance.uniform() ** 2 + reach
     return Slots(
         u=_BACK + _STREET * (place + step * chance.uniform()),
         v=ground.middle + side * away,
         yaw=jnp.where(chance.flip(0.15), 0.5, 0.02) * chance.normal(),
         kind=jnp.array([kind.kind for kind in table]),
-        present=chance.uniform() < of_kinds.uniform(0.1, 0.9)[index],
+        present=chance.uniform() < of_kinds.uniform(0.4, 1.0)[index],
         size=size,
     )
 

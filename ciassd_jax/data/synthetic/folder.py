@@ -44,8 +44,8 @@ def write_synthetic(
     """Write frames 0 to `frames` - 1 of a seed as OUT/training and OUT/ImageSets; returns the pairs over capacity.
 
     Frames 3, 7, 11, ... are the split val, the others train. Frame i depends on the seed and i alone. `overwrite`
-    replaces what this function wrote there before. `track` sees the frames go by, for a progress bar. Raises FormatError
-    for a folder that cannot be used, and without pillow.
+    replaces what this function wrote there before. `track` sees the frames go by, for a progress bar. Raises
+    FormatError for a folder that cannot be used, and without pillow.
     """
     folder = Path(out)
     _require_pillow()

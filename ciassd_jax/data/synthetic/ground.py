@@ -19,7 +19,8 @@ class Ground(NamedTuple):
 
     The road runs along u: (u, v) are (x, y) turned by -yaw. It holds |v - middle| < half_width; a crossing street holds
     |u - crossing| < crossing_half. Pavements reach `pavement` metres from the road; beyond is grass or more paving,
-    `roughness` (standard deviation, metres) uneven. A scene without a crossing has it out of sight.
+    `roughness` (standard deviation, metres)
+    uneven. `shade` is a factor on all reflectances of the ground. A scene without a crossing has it out of sight.
     """
 
     sensor_height: Float[Array, "*s"]
@@ -33,6 +34,7 @@ class Ground(NamedTuple):
     kerb: Float[Array, "*s"]
     pavement: Float[Array, "*s"]
     beyond: Int[Array, "*s"]
+    shade: Float[Array, "*s"]
     roughness: Float[Array, "*s"]
 
 
@@ -79,7 +81,7 @@ def _height_at(ground: Ground, off_road: Bool[Array, "rows columns"]) -> Array:
 
 
 def _meet(ground: Ground, height: Array, fall: Array) -> Array:
-    """Where rays that fall `fall` per metre meet the paraboloid so far below the sensor: bend/2 t^2 + fall t = height."""
+    """Where rays that fall `fall` per metre meet the paraboloid so far below: bend/2 t^2 + fall t = height."""
     root = jnp.sqrt(jnp.maximum(fall**2 + 2 * ground.bend * height, 0.0))
     never = (fall**2 + 2 * ground.bend * height < 0) | (fall + root <= 1e-4)
     return jnp.where(never, jnp.inf, 2 * height / jnp.maximum(fall + root, 1e-4))

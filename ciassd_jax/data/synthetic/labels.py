@@ -13,7 +13,7 @@ from ciassd_jax.types import Boxes
 # Parts of an object that may be hidden for the occlusions 0 (visible), 1 (partly) and 2 (largely).
 _HIDDEN = (0.2, 0.55, 0.85)
 # An object needs so many rays to be labelled, so many pixels of height, and this part within the image.
-_LEAST_RAYS, _LEAST_HEIGHT, _LEAST_INSIDE = 3, 14.0, 0.05
+_LEAST_RAYS, _LEAST_HEIGHT, _LEAST_INSIDE = 4, 17.0, 0.05
 # Nearer than that to the camera's plane a corner's pixels mean nothing.
 _NEAREST_DEPTH = 0.5
 _DONT_CARE = ObjectRow("DontCare", -1.0, -1, -10.0, (0, 0, 0, 0), (-1, -1, -1), (-1000, -1000, -1000), -10.0)
@@ -39,7 +39,8 @@ def label_rows(
     labelled = []
     order = np.argsort([row.location[2] for row in rows], kind="stable")
     for index in order.tolist():
-        row, x1, y1, x2, y2 = rows[index], *rows[index].bbox
+        row = rows[index]
+        x1, y1, x2, y2 = row.bbox
         if hidden[index] > _HIDDEN[-1] or inside[index] < _LEAST_INSIDE or x2 - x1 < 2 or y2 - y1 < 2:
             continue
         if arriving[kept[index]] < _LEAST_RAYS or y2 - y1 < _LEAST_HEIGHT:

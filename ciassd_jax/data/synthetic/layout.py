@@ -30,7 +30,7 @@ from ciassd_jax.data.synthetic.slots import Chance, Slots, deal, join, keep_apar
 from ciassd_jax.data.synthetic.solids import Solids, place, solid, stack
 from ciassd_jax.types import Array, Boxes
 
-# Slots: of a lane, of all lanes, and in all for parked cars, yards, the crossing street and people; half on either side.
+# Slots: of a lane, of all lanes; of parked cars, yards, the crossing street and people, half of them on either side.
 _LANE, _TRAFFIC, _PARKED, _YARDS, _CROSSING, _PEOPLE = 8, 48, 52, 16, 6, 16
 _OBJECTS = _TRAFFIC + _PARKED + _YARDS + _CROSSING + _PEOPLE
 _SIDES = (1, -1)
@@ -72,10 +72,22 @@ class Street(NamedTuple):
     yards: Float[Array, ""]
 
 
+@jax.jit
 def sample_world(key: jax.Array) -> World:
     """Draw a scene."""
     chances = deal(key, 1, 1, _TRAFFIC, _PARKED, _YARDS, _CROSSING, _PEOPLE, _OBJECTS, NUM_CLUTTER, NUM_CLUTTER_KINDS)
-    for_street, for_ground, for_traffic, for_parked, for_yards, for_crossing, for_people, chance, *for_clutter = chances
+    (
+        for_street,
+        for_ground,
+        for_traffic,
+        for_parked,
+        for_yards,
+        for_crossing,
+        for_people,
+        chance,
+        clutter_chance,
+        of_kinds,
+    ) = chances
     street = _draw_street(for_street)
     ground = _draw_ground(for_ground, street)
     vehicles = join(
@@ -87,7 +99,7 @@ def sample_world(key: jax.Array) -> World:
     slots = join(vehicles, _draw_people(for_people, street, ground))
     size = jax.vmap(draw_size)(jnp.stack([chance.normal() for _ in range(3)], -1), slots.kind)
     style = jnp.stack([chance.uniform() for _ in range(NUM_STYLES)], -1)
-    objects, clutter = _settle(slots, size, draw_clutter(*for_clutter, ground), ground)
+    objects, clutter = _settle(slots, size, draw_clutter(clutter_chance, of_kinds, ground), ground)
     number = len(vehicles.u)
     solids = [
         _build(vehicle, objects, style, slice(0, number)),
@@ -122,7 +134,7 @@ def _draw_ground(chance: Chance, street: Street) -> Ground:
         sensor_height=1.73 + 0.03 * chance.normal(),
         slope=jnp.stack([0.006 + 0.006 * chance.normal(), 0.008 * chance.normal()]),
         bend=1.0e-4 * chance.normal(),
-        yaw=0.05 * chance.normal(),
+        yaw=jnp.where(chance.flip(0.2), 0.3, 0.05) * chance.normal(),
         middle=middle + (street.strip[0] - street.strip[1]) / 2,
         half_width=half + street.strip.mean(),
         crossing=jnp.where(chance.flip(0.4), chance.uniform(6.0, 55.0), _NOWHERE),
@@ -130,7 +142,8 @@ def _draw_ground(chance: Chance, street: Street) -> Ground:
         kerb=chance.uniform(0.03, 0.16),
         pavement=chance.uniform(1.2, 4.0),
         beyond=jnp.where(chance.flip(0.6), material("grass"), material("paving")),
-        roughness=chance.uniform(0.01, 0.06),
+        shade=chance.uniform(0.75, 1.3),
+        roughness=chance.uniform(0.01, 0.045),
     )
 
 
@@ -172,7 +185,7 @@ def _draw_yards(chance: Chance, street: Street, ground: Ground) -> Slots:
     return Slots(
         u=chance.uniform(-20.0, 70.0),
         v=ground.middle + side * away,
-        yaw=quarter + jnp.where(chance.flip(0.3), 0.6, 0.05) * chance.normal(),
+        yaw=quarter + jnp.where(chance.flip(0.4), 0.6, 0.05) * chance.normal(),
         kind=_vehicle_kind(chance, vans=0.1, trucks=0.03),
         present=chance.flip(street.yards),
     )
@@ -184,7 +197,7 @@ def _draw_crossing(chance: Chance, ground: Ground) -> Slots:
     return Slots(
         u=ground.crossing + side * ground.crossing_half / 2,
         v=ground.middle + chance.uniform(-30.0, 30.0),
-        yaw=side * jnp.pi / 2 + 0.15 * chance.normal(),
+        yaw=side * jnp.pi / 2 + 0.3 * chance.normal(),
         kind=_vehicle_kind(chance, vans=0.1, trucks=0.03),
         present=chance.flip(0.35) & (ground.crossing < _NOWHERE),
     )
@@ -221,7 +234,7 @@ def _settle(slots: Slots, size: Float[Array, "O 3"], clutter: Slots, ground: Gro
     x, y = road_to_lidar(ground, u, v)
     yaw = jnp.concatenate([slots.yaw, clutter.yaw]) + ground.yaw
     assert clutter.size is not None
-    size = jnp.concatenate([size, clutter.size])
+    size = jnp.concatenate([jnp.asarray(size), clutter.size])
     height = ground_height(ground, x, y) + size[:, 2] / 2
     boxes = Boxes(jnp.stack([x, y, height], -1), size, yaw)
     # Only what parks or stands must leave the crossing street free, and only traffic keeps its distance.
@@ -229,8 +242,8 @@ def _settle(slots: Slots, size: Float[Array, "O 3"], clutter: Slots, ground: Gro
     standing = ((index >= _TRAFFIC) & (index < parked)) | (index >= len(slots.u))
     reach = (jnp.abs(jnp.cos(yaw)) * size[:, 0] + jnp.abs(jnp.sin(yaw)) * size[:, 1]) / 2
     in_street = standing & (jnp.abs(u - ground.crossing) < ground.crossing_half + reach + 0.5)
-    present = jnp.concatenate([slots.present, clutter.present]) & ~in_street
-    present = keep_apart(boxes, present, margin=0.3, moving=index < _TRAFFIC)
+    wanted = jnp.concatenate([slots.present, clutter.present]) & ~in_street
+    present = keep_apart(boxes, wanted, margin=0.3, moving=index < _TRAFFIC)
     number = len(slots.u)
     objects = Objects(jax.tree.map(lambda leaf: leaf[:number], boxes), slots.kind, present[:number])
     return objects, clutter._replace(present=present[number:])

@@ -52,7 +52,7 @@ def person(size: Float[Array, " 3"], kind: Int[Array, ""], style: Float[Array, "
 
 def _paint(style: Float[Array, " n"]) -> Array:
     """Reflectance of a vehicle's paint: near half of all hardly reflect, the others anything up to white."""
-    return jnp.where(style[6] < 0.45, 0.05 + 0.1 * style[7], 0.25 + 0.45 * style[7])
+    return jnp.where(style[6] < 0.5, 0.04 * style[7], 0.3 + 0.5 * style[7])
 
 
 def _car(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
@@ -67,7 +67,7 @@ def _car(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
     clearance, belt = 0.15 + 0.07 * style[0], height * (0.60 + 0.05 * style[1])
     bonnet, nose = length * (0.22 + 0.07 * style[3]), height * (0.43 + 0.06 * style[5])
     tilt = (nose - belt) / bonnet
-    rounding = (1.457 * front, 1.1 * side, jnp.inf)
+    rounding = (1.1 * front, 1.2 * side, jnp.inf)
     glass = front - bonnet
     screens = (-1.0 - 0.5 * style[4], recede, -0.25, -0.03)
     roof = height - belt
@@ -76,7 +76,7 @@ def _car(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
         limits = (glass + grow, front - lid + grow - 0.05, side - 0.04 + grow, roof - 0.01 + grow, low)
         return solid((0, 0, belt), limits, material(name), lean=screens, shade=paint if name == "paint" else 1.0)
 
-    pillar = (0.12, 0.02, side - 0.03, roof - 0.02, 0.0)
+    pillar = (0.1, 0.04, 0.03, roof - 0.06, 0.0)
     return stack(
         [
             solid(
@@ -97,7 +97,10 @@ def _car(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
             ),
             cabin(0.0, 0.0, "glass"),
             cabin(0.08 - roof, 0.01, "paint"),
-            solid((-0.05 * length, 0, belt), pillar, material("paint"), lean=(0, 0, -0.25, 0), shade=paint),
+            *(
+                solid((-0.05 * length, sign * (side - 0.13), belt), pillar, material("paint"), shade=paint)
+                for sign in (1, -1)
+            ),
             *_wheels(front - 0.2 * length, 0.19 * length - front, side, 0.29 + 0.04 * style[0], 0.09),
             *_plates(front, jnp.where(chosen == 0, 0.8, 0.65)),
         ]
@@ -135,6 +138,7 @@ def _van(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
             *_wheels(front - 0.18 * length, 0.2 * length - front, side, 0.33, 0.1),
             *_plates(front, 0.8),
             hidden,
+            hidden,
         ]
     )
 
@@ -155,6 +159,7 @@ def _truck(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
             block((0, 0, 0.75), (length - 0.6, 0.9, 0.5), material("trim")),
             *_wheels(front - 1.4, 1.9 - front, side, 0.5, 0.15),
             *_plates(front, 0.9),
+            _absent(),
             _absent(),
         ]
     )
@@ -208,9 +213,7 @@ def _cyclist(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
     wheel = (radius, radius, 0.025, radius, radius)
     return stack(
         [
-            solid(
-                (sign * (length / 2 - radius), 0, radius), wheel, material("spokes"), radii=(radius, jnp.inf, radius)
-            )
+            solid((sign * (length / 2 - radius), 0, radius), wheel, material("spokes"), radii=(radius, jnp.inf, radius))
             for sign in (1, -1)
         ]
         + [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from jaxtyping import Float, Int
 from ciassd_jax.data.synthetic.casting import TILE, Rays, cast
 from ciassd_jax.data.synthetic.ground import cast_ground
 from ciassd_jax.data.synthetic.layout import World
-from ciassd_jax.data.synthetic.materials import MATERIALS, material
+from ciassd_jax.data.synthetic.materials import MATERIALS
 from ciassd_jax.types import Array, PointCloud
 
 
@@ -22,14 +23,15 @@ class Lidar:
     """The sensor's numbers: those of the HDL-64E as its full KITTI frames show them.
 
     Two blocks of beams between two elevations in degrees each; columns are azimuths, evenly spaced round the circle.
-    `noise` is the standard deviation of a range in metres, `max_range` the farthest return.
+    `noise` is the standard deviation of a range and `max_range` the farthest return in metres, `lost` the part of the
+    rays that never returns from anywhere.
     """
 
     upper: tuple[float, float, int] = (2.4, -7.85, 32)
     lower: tuple[float, float, int] = (-8.4, -23.7, 32)
-    columns: int = 2048
+    columns: int = 2176
     noise: float = 0.02
-    lost: float = 0.03
+    lost: float = 0.01
     max_range: float = 80.0
     # Pairs of a solid and a tile of 16 x 16 rays (`casting`).
     max_pairs: int = 4096
@@ -45,63 +47,105 @@ class Lidar:
         return Rays(jnp.asarray(azimuth, jnp.float32), jnp.asarray(np.tan(elevation), jnp.float32))
 
 
-class Scan(NamedTuple):
-    """What the sensor records, beam by beam.
+class Draws(NamedTuple):
+    """What chance gives every ray: a range error and a spread of intensity (standard normal), whether it returns
+    (uniform), and how far it strays into leaves and cabins (exponential)."""
 
-    `range` is the true distance in metres to what a ray meets first, whether it returns or not, inf for nothing; `owner`
-    the object it is part of, -1 for none. `dropped` counts pairs over capacity (`casting.Hits`).
+    error: Float[Array, "*s rows columns"]
+    spread: Float[Array, "*s rows columns"]
+    fate: Float[Array, "*s rows columns"]
+    stray: Float[Array, "*s rows columns"]
+
+
+class Sight(NamedTuple):
+    """What every ray meets first, whether it returns or not.
+
+    `range` is the distance in metres, inf for nothing; `cosine` that of incidence; `owner` the object, -1 for none.
+    `dropped` counts pairs over capacity (`casting.Hits`).
     """
 
-    cloud: PointCloud
     range: Float[Array, "*s rows columns"]
+    cosine: Float[Array, "*s rows columns"]
+    material: Int[Array, "*s rows columns"]
+    shade: Float[Array, "*s rows columns"]
     owner: Int[Array, "*s rows columns"]
     dropped: Int[Array, "*s"]
 
 
-def scan(key: jax.Array, world: World, lidar: Lidar) -> Scan:
-    """One turn of the sensor."""
-    rays = lidar.rays()
-    shape = (rays.tangent.size, rays.azimuth.size)
-    keys = jax.random.split(key, 4)
-    table = jnp.array(MATERIALS)
-    stray, rough = jax.random.exponential(keys[0], shape), jax.random.normal(keys[1], shape)
-    hits = cast(world.solids, table[world.solids.material, 3], rays, stray, lidar.max_pairs)
-    below, below_cosine, below_material = cast_ground(world.ground, rays.azimuth, rays.tangent, rough)
-    solid = jnp.where(hits.distance < below, hits.solid, -1)
-    on_solid = solid >= 0
-    stretch = jnp.sqrt(1 + rays.tangent**2)[:, None]
-    distance = jnp.minimum(hits.distance, below) * stretch
-    cosine = jnp.where(on_solid, hits.cosine, below_cosine)
-    surface = table[jnp.where(on_solid, world.solids.material[solid], below_material)]
-    shade = jnp.where(on_solid, world.solids.shade[solid], 1.0)
-    signal = _signal(keys[2], surface, shade, cosine)
-    returned = _returns(keys[3], surface, signal, cosine, distance, lidar)
-    noisy = distance + lidar.noise * rough
-    owner = jnp.where(on_solid, world.solids.owner[solid], -1)
-    cloud = _compact((*_positions(rays, noisy / stretch), signal), returned)
-    return Scan(cloud, distance, owner, hits.dropped)
+def scan(key: jax.Array, world: World, lidar: Lidar) -> tuple[PointCloud, Sight]:
+    """One turn of the sensor: the points that it records beam by beam, and what its rays met."""
+    draws = _draw(key, lidar)
+    sight = _look(world, draws, lidar)
+    return _record(sight, draws, lidar), sight
 
 
-def _signal(key: jax.Array, surface: Array, shade: Array, cosine: Array) -> Array:
-    """Intensity in hundredths, as KITTI's: reflectance by material and shade, less at flat angles."""
-    spread = surface[..., 1] * jax.random.normal(key, cosine.shape)
-    glossy = surface[..., 0] >= 1
-    level = surface[..., 0] * shade * jnp.where(glossy, 0.7 * cosine**2, 0.75 + 0.25 * cosine)
-    return jnp.round(100 * jnp.clip(level + spread * jnp.sqrt(shade), 0.0, 0.99)) / 100
+# Each step is a program of its own: in one program XLA fuses across the steps and computes much of them several times.
+@partial(jax.jit, static_argnames="lidar")
+def _draw(key: jax.Array, lidar: Lidar) -> Draws:
+    shape = (lidar.upper[2] + lidar.lower[2], lidar.columns)
+    bits = jax.random.bits(key, (4, *shape))
+    # From below 1, so that the logarithm is finite.
+    uniform = (bits[2:] >> 8).astype(jnp.float32) * 2.0**-24
+    return Draws(_bell(bits[0]), _bell(bits[1]), uniform[0], -jnp.log1p(-uniform[1]))
 
 
-def _returns(key: jax.Array, surface: Array, signal: Array, cosine: Array, distance: Array, lidar: Lidar) -> Array:
-    """Whether a ray returns: not from too far, seldom from flat angles, dark surfaces and windows."""
-    energy = (0.08 + signal) * (0.03 + jnp.maximum(cosine, 0)) * (30.0 / distance) ** 2
-    likely = (1 - surface[..., 2]) * (1 - lidar.lost) * (1 - jnp.exp(-60 * energy))
-    return (jax.random.uniform(key, distance.shape) < likely) & (distance < lidar.max_range)
+def _bell(bits: Array) -> Array:
+    """Mean 0 and deviation 1 from random bits: the sum of four bytes, which lies within 3.5 deviations."""
+    total = sum((bits >> shift & 255).astype(jnp.float32) for shift in (0, 8, 16, 24))
+    return (total - 510.0) / np.sqrt(4 * (256**2 - 1) / 12).astype(np.float32)
 
 
-def _positions(rays: Rays, distance: Array) -> tuple[Array, Array, Array]:
-    """x, y, z of points at horizontal distances; nothing at the sensor for no hit."""
-    distance = jnp.where(jnp.isfinite(distance), distance, 0.0)
+@partial(jax.jit, static_argnames="lidar")
+def _look(world: World, draws: Draws, lidar: Lidar) -> Sight:
+    """Cast the rays at the solids and the ground."""
+    rays, depth = lidar.rays(), jnp.array(MATERIALS)[world.solids.material, 3]
+    hits = cast(world.solids, depth, rays, draws.stray, lidar.max_pairs)
+    ground = cast_ground(world.ground, rays.azimuth, rays.tangent, _waves(draws.error))
+    solid = jnp.where(hits.distance < ground[0], hits.solid, -1)
+    found = solid >= 0
+    return Sight(
+        range=jnp.minimum(hits.distance, ground[0]) * jnp.sqrt(1 + rays.tangent**2)[:, None],
+        cosine=jnp.where(found, hits.cosine, ground[1]),
+        material=jnp.where(found, world.solids.material[solid], ground[2]),
+        shade=jnp.where(found, world.solids.shade[solid], world.ground.shade),
+        owner=jnp.where(found, world.solids.owner[solid], -1),
+        dropped=hits.dropped,
+    )
+
+
+@partial(jax.jit, static_argnames="lidar")
+def _record(sight: Sight, draws: Draws, lidar: Lidar) -> PointCloud:
+    """The rays that return, as points."""
+    rays, surface = lidar.rays(), jnp.array(MATERIALS)[sight.material]
+    signal = _signal(surface, sight, draws.spread)
+    returned = (draws.fate < _likelihood(surface, signal, sight, lidar)) & (sight.range < lidar.max_range)
+    noisy = jnp.where(returned, sight.range, 0.0) + lidar.noise * draws.error
+    flat = noisy / jnp.sqrt(1 + rays.tangent**2)[:, None]
     x, y = jnp.cos(rays.azimuth)[None], jnp.sin(rays.azimuth)[None]
-    return distance * x, distance * y, distance * rays.tangent[:, None]
+    return _compact((flat * x, flat * y, flat * rays.tangent[:, None], signal), returned)
+
+
+def _waves(noise: Float[Array, "rows columns"]) -> Array:
+    """Standard normal numbers that go together over 16 columns, as bumps of the ground do, from independent ones."""
+    for shift in (1, 2, 4, 8):
+        noise = (noise + jnp.roll(noise, shift, 1)) * 0.5**0.5
+    return noise
+
+
+def _signal(surface: Float[Array, "rows columns 4"], sight: Sight, spread: Float[Array, "rows columns"]) -> Array:
+    """Intensity in hundredths, as KITTI's: reflectance by material and shade, less at flat angles."""
+    glossy = surface[..., 0] >= 1
+    angle = jnp.where(glossy, 0.15 + 0.55 * sight.cosine**2, 0.75 + 0.25 * sight.cosine)
+    level = surface[..., 0] * sight.shade * angle + surface[..., 1] * spread * jnp.sqrt(sight.shade)
+    return jnp.round(100 * jnp.clip(level, 0.0, 0.99)) / 100
+
+
+def _likelihood(
+    surface: Float[Array, "rows columns 4"], signal: Float[Array, "rows columns"], sight: Sight, lidar: Lidar
+) -> Array:
+    """How likely rays return: seldom from far away, from flat angles, dark surfaces and windows."""
+    energy = (0.035 + signal) * (0.05 + jnp.maximum(sight.cosine, 0)) * (30.0 / sight.range) ** 2
+    return (1 - surface[..., 2]) * (1 - lidar.lost) * (1 - jnp.exp(-60 * energy))
 
 
 def _compact(columns: tuple[Array, ...], kept: Array) -> PointCloud:

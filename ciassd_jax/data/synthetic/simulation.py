@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -24,7 +24,7 @@ from ciassd_jax.formats.kitti_difficulty import difficulty_of
 from ciassd_jax.types import Array, PointCloud
 
 # Pairs of an object ahead and a tile of rays.
-_MAX_PAIRS = 2048
+_MAX_PAIRS = 1024
 
 
 class Simulated(NamedTuple):
@@ -63,16 +63,22 @@ def simulate(key: jax.Array, lidar: Lidar) -> Simulated:
 
 def observe(key: jax.Array, world: World, lidar: Lidar) -> Simulated:
     """Scan a scene, and count the rays that get to its objects."""
-    recorded = scan(key, world, lidar)
+    cloud, sight = scan(key, world, lidar)
+    through, arriving, dropped = _count(world.objects, sight.range, lidar)
+    return Simulated(cloud, world.objects, through, arriving, sight.dropped + dropped)
+
+
+@partial(jax.jit, static_argnames="lidar")
+def _count(objects: Objects, distance: Array, lidar: Lidar) -> tuple[Array, Array, Array]:
+    """Rays through the boxes of objects ahead, those that get there, and pairs over capacity."""
     rays = lidar.rays()
-    flat = recorded.range / jnp.sqrt(1 + rays.tangent**2)[:, None]
-    through, arriving, dropped = count_rays(_box_solids(world.objects), rays, flat, _MAX_PAIRS)
-    return Simulated(recorded.cloud, world.objects, through, arriving, recorded.dropped + dropped)
+    flat = distance / jnp.sqrt(1 + rays.tangent**2)[:, None]
+    return count_rays(_box_solids(objects), rays, flat, _MAX_PAIRS)
 
 
 def make_frame(seed: int, index: int, lidar: Lidar | None = None) -> SyntheticFrame:
     """Simulate frame `index` of `seed` with its labels."""
-    simulated = jax.device_get(_program(lidar or Lidar())(frame_key(seed, index)))
+    simulated = jax.device_get(simulate(frame_key(seed, index), lidar or Lidar()))
     present = simulated.objects.present
     boxes = jax.tree.map(lambda leaf: leaf[present].astype(np.float64), simulated.objects.boxes)
     counts = (simulated.objects.kind, simulated.through, simulated.arriving)
@@ -100,11 +106,6 @@ def read_synthetic_frame(name: str, *, seed: int, lidar: Lidar) -> Frame:
     boxes = rows_to_boxes(rows, frame.camera.calibration)
     points = crop_to_view(frame.points, frame.camera)
     return Frame(name, points, boxes, tuple(row.type for row in rows), difficulty, frame.camera)
-
-
-@cache
-def _program(lidar: Lidar) -> jax.stages.Wrapped:
-    return jax.jit(partial(simulate, lidar=lidar))
 
 
 def _box_solids(objects: Objects) -> Solids:

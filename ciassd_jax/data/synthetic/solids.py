@@ -1,7 +1,7 @@
 """Convex solids that everything in a synthetic scene is built of, and where a ray meets them.
 
-A solid has a frame of its own: u forward, v left, w up from its origin, turned by yaw about z. It is the intersection of
-six half-spaces whose faces may slope and of an ellipsoid or elliptic cylinder about its origin.
+A solid has a frame of its own: u forward, v left, w up from its origin, turned by yaw about z. It is the intersection
+of six half-spaces whose faces may slope and of an ellipsoid or elliptic cylinder about its origin.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Solids(NamedTuple):
     With (u, v, w) in a solid's frame it holds the points with u <= front + lean[0] w, -u <= rear + lean[1] w,
     |v| <= side + lean[2] w, w <= top + lean[3] u, -w <= bottom, and curve . (u^2, v^2, w^2) <= 1, where `curve` are
     inverse squared radii, 0 for none. `limits` are (front, rear, side, top, bottom). `material` is an index into
-    `materials.MATERIALS`, `shade` a factor on its reflectance, `owner` the object that the solid is part of, -1 for none.
+    `materials.MATERIALS`, `shade` a factor on its reflectance, `owner` the object it is part of, -1 for none.
     """
 
     origin: Float[Array, "*s 3"]
@@ -148,7 +148,7 @@ def extent(solids: Solids) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def _faces(solids: Solids, direction: tuple[Array, Array, Array]) -> list[tuple[Array, Array, Array]]:
-    """Of every half-space: its left side minus its right at the sensor, the rate of that along rays, its normal's length."""
+    """Of every half-space: left minus right side at the sensor, the rate of that along rays, its normal's length."""
     du, dv, dw = direction
     u, v, w = sensor_in(solids)
     front, rear, side, top, bottom = (solids.limits[..., i] for i in range(5))
@@ -165,7 +165,7 @@ def _faces(solids: Solids, direction: tuple[Array, Array, Array]) -> list[tuple[
 
 def _cross_ellipsoid(solids: Solids, direction: tuple[Array, Array, Array]) -> tuple[Array, Array]:
     """Where rays enter and leave the ellipsoid: roots of a quadratic; (inf, -inf) where there are none."""
-    square, half, rest = 0.0, 0.0, -1.0
+    square, half, rest = jnp.zeros(()), jnp.zeros(()), -jnp.ones(())
     for axis, (place, rate) in enumerate(zip(sensor_in(solids), direction, strict=True)):
         curve = solids.curve[..., axis]
         square, half, rest = square + curve * rate**2, half + curve * place * rate, rest + curve * place**2
@@ -180,7 +180,7 @@ def _cross_ellipsoid(solids: Solids, direction: tuple[Array, Array, Array]) -> t
 def _ellipsoid_cosine(solids: Solids, direction: tuple[Array, Array, Array], length: Array) -> Array:
     """Cosine of incidence where rays enter the ellipsoid: its gradient there along the ray."""
     enter, _ = _cross_ellipsoid(solids, direction)
-    along, square = 0.0, 0.0
+    along, square = jnp.zeros(()), jnp.zeros(())
     for axis, (place, rate) in enumerate(zip(sensor_in(solids), direction, strict=True)):
         gradient = solids.curve[..., axis] * (place + enter * rate)
         along, square = along - gradient * rate, square + gradient**2

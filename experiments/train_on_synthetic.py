@@ -1,0 +1,60 @@
+"""The bundled weights: `car_lite` trained on synthetic scenes alone, scored on others and on real frames.
+
+    python experiments/train_on_synthetic.py --workdir /tmp/synthetic [--kitti ../shared/kitti]
+
+Each part is a command of `ciassd`, printed before it runs. Started again it goes on: the scenes are kept, the training
+resumes. Writes WORKDIR/car_lite.safetensors; the one in the package is such a file. Results: README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from ciassd_jax.cli import main as ciassd
+
+FRAMES, HELD_OUT = 2000, 200
+TRAIN_SEED, HELD_OUT_SEED = 1, 2
+TRAINING = "--preset car_lite --batch-size 2 --learning-rate 2e-3 --evaluate-every 0 --seed 0"
+
+
+def run(*words: str | Path) -> None:
+    """Run one command of `ciassd`; the program ends with its exit code where that is not 0."""
+    arguments = [str(word) for word in words]
+    print("\n$ ciassd", *arguments, flush=True)
+    code = ciassd(arguments)
+    if code:
+        sys.exit(code)
+
+
+def simulate(folder: Path, frames: int, seed: int) -> None:
+    """Write the scenes, unless all are there."""
+    if not (folder / f"training/label_2/{frames - 1:06d}.txt").is_file():
+        run("data", "synth", folder, "--frames", str(frames), "--seed", str(seed), "--overwrite")
+
+
+def main() -> None:
+    """Simulate, train, convert, score."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--workdir", type=Path, required=True)
+    parser.add_argument("--kitti", type=Path, help="real frames to score too")
+    parser.add_argument("--steps", type=int, default=4000)
+    parser.add_argument("--frames", type=int, default=FRAMES)
+    parser.add_argument("--held-out", type=int, default=HELD_OUT)
+    options = parser.parse_args()
+
+    scenes, held_out = options.workdir / "scenes", options.workdir / "held_out"
+    weights = options.workdir / "car_lite.safetensors"
+    simulate(scenes, options.frames, TRAIN_SEED)
+    simulate(held_out, options.held_out, HELD_OUT_SEED)
+    workdir, steps = options.workdir / "training", str(options.steps)
+    run("train", "--data", scenes, "--workdir", workdir, "--steps", steps, *TRAINING.split())
+    run("convert", workdir / "last.safetensors", weights, "--half")
+    run("eval", "--weights", weights, "--data", held_out, "--split", "trainval")
+    if options.kitti is not None:
+        run("eval", "--weights", weights, "--data", options.kitti)
+
+
+if __name__ == "__main__":
+    main()
