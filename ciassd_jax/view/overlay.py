@@ -35,8 +35,8 @@ def plot_overlay(
     """The image with the ground truth in red and detections in green, with their scores, as the paper's Figure 5.
 
     Boxes are x, y, z, length, width, height (metres), yaw in the LiDAR frame; each has a line along its bottom through
-    its front. Lines that pass the camera's plane are cut there; boxes outside the image, and
-    such as are not finite, are not drawn.
+    its front. Lines that pass the camera's plane are cut there; boxes outside the image, and such as
+    are not finite, are not drawn.
     """
     height, width = image.shape[:2]
     figure = Picture(figsize=(width / _SCALE, height / _SCALE + 0.3 * bool(title)), dpi=1.5 * _SCALE)

@@ -19,8 +19,8 @@ class Ground(NamedTuple):
 
     The road runs along u: (u, v) are (x, y) turned by -yaw. It holds |v - middle| < half_width; a crossing street holds
     |u - crossing| < crossing_half. Pavements reach `pavement` metres from the road; beyond is grass or more paving,
-    `roughness` (standard deviation, metres)
-    uneven. `shade` is a factor on all reflectances of the ground. A scene without a crossing has it out of sight.
+    uneven by `roughness` (standard deviation, metres). `shade` is a factor on all reflectances of the ground. A scene
+    without a crossing has it out of sight.
     """
 
     sensor_height: Float[Array, "*s"]

@@ -21,7 +21,7 @@ _EGO = (6.0, 2.6, 1.5)
 class Chance:
     """Independent uniform draws [D, n] for n slots, or [D] for one; every use takes the next ones."""
 
-    def __init__(self, draws: Float[Array, D * n]) -> None:
+    def __init__(self, draws: Float[Array, " D *n"]) -> None:
         self._draws = iter(draws)
 
     def uniform(self, low: Array | float = 0.0, high: Array | float = 1.0) -> Array:
