@@ -17,7 +17,7 @@ from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.formats.points import scale_intensity
 from ciassd_jax.prediction import predict, variables_of
-from ciassd_jax.types import Array, Counts, PointCloud, Variables
+from ciassd_jax.types import Array, Counts, Detections, PointCloud, Variables
 from ciassd_jax.weights import load_weights
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from ciassd_jax.view.html import Page
 
 BUNDLED = Path(__file__).parent / "bundled"
+# Points per bucket; four times as many for ever larger clouds.
+SMALLEST_BUCKET = 32768
 # Half-spaces that hold every point: no camera, no frustum.
 ANYWHERE = np.tile(np.array([0, 0, 0, 1], np.float32), (6, 1))
 
@@ -94,9 +96,6 @@ class Detector:
     Clouds are padded to a bucket of points and the program is compiled once per bucket.
     """
 
-    # Points per bucket; four times as many for ever larger clouds.
-    smallest_bucket = 32768
-
     def __init__(self, variables: Variables, config: Config) -> None:
         self.config = config
         self._variables = jax.device_put(variables_of(variables))
@@ -138,34 +137,45 @@ class Detector:
         points = _check_points(np.asarray(points))
         program = self.compile(len(points))
         start = time.perf_counter()
-        padded = np.zeros((1, self._bucket(len(points)), 4), np.float32)
-        padded[0, : len(points)] = points
-        cloud = PointCloud(padded, np.array([len(points)], np.int32))
         planes = ANYWHERE if frustum is None else np.asarray(frustum, np.float32)
-        batch = jax.device_get(program(self._variables, cloud, frustum=planes[None]))
-        seconds = time.perf_counter() - start
-        scene = jax.tree.map(lambda leaf: leaf[0], batch)
-        counts = _plain_counts(scene.counts)
-        _warn_of_drops(counts, int((~np.isfinite(points).all(1)).sum()))
-        n = int(scene.count)
-        names = self.config.class_names
-        boxes = scene.boxes.to_array()[:n]
-        return FrameResult(boxes, scene.score[:n], tuple(names[i] for i in scene.label[:n]), counts, seconds)
+        batch = jax.device_get(program(self._variables, pad_to_bucket(points), frustum=planes[None]))
+        result = frame_result(batch, self.config, time.perf_counter() - start)
+        _warn_of_drops(result.counts, int((~np.isfinite(points).all(1)).sum()))
+        return result
 
     def compile(self, num_points: int) -> jax.stages.Compiled:
         """The program for clouds of up to so many points, compiled on first use."""
-        bucket = self._bucket(num_points)
+        bucket = bucket_of(num_points)
         if bucket not in self._programs:
             cloud = PointCloud(np.zeros((1, bucket, 4), np.float32), np.zeros(1, np.int32))
             step = jax.jit(predict, static_argnames="config")
             self._programs[bucket] = step.lower(self._variables, cloud, self.config, frustum=ANYWHERE[None]).compile()
         return self._programs[bucket]
 
-    def _bucket(self, num_points: int) -> int:
-        bucket = self.smallest_bucket
-        while bucket < num_points:
-            bucket *= 4
-        return bucket
+
+def bucket_of(num_points: int) -> int:
+    """The padded size of a cloud of so many points: programs are compiled for a few sizes only."""
+    bucket = SMALLEST_BUCKET
+    while bucket < num_points:
+        bucket *= 4
+    return bucket
+
+
+def pad_to_bucket(points: np.ndarray) -> PointCloud:
+    """Points [N, 4] as a batch of one cloud, padded to its bucket."""
+    padded = np.zeros((1, bucket_of(len(points)), 4), np.float32)
+    padded[0, : len(points)] = points
+    return PointCloud(padded, np.array([len(points)], np.int32))
+
+
+def frame_result(batch: Detections, config: Config, seconds: float) -> FrameResult:
+    """The detections of a batch of one scene, which took so long, as NumPy arrays."""
+    scene = jax.tree.map(lambda leaf: np.asarray(leaf[0]), batch)
+    count = int(scene.count)
+    labels = tuple(config.class_names[label] for label in scene.label[:count])
+    return FrameResult(
+        scene.boxes.to_array()[:count], scene.score[:count], labels, _plain_counts(scene.counts), seconds
+    )
 
 
 def find_weights(path_or_name: str | os.PathLike[str]) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -61,27 +61,61 @@ def detect_dataset(
     drop (DroppedWarning) is summed over all frames and warned of at the end. Raises FormatError for a frame
     that cannot be read or has no labels.
     """
-    frames: list[ScoredFrame] = []
-    lacking: dict[str, list[str]] = {}
-    for index, _ in enumerate(track(dataset.names)):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", FormatWarning)
+    scored: list[ScoredFrame] = []
+    for frame, truth in labelled_frames(dataset, track):
+        with warnings.catch_warnings():
             # The counts of the results say the same.
             warnings.filterwarnings("ignore", "Dropped ", DroppedWarning)
-            frames.append(_score_frame(detector, dataset.read(index), dataset.sources(index)))
+            result = detect_in_view(detector, frame.points, frame.camera)
+        scored.append(score_frame(frame, truth, result))
+    warn_of_dropped(scored)
+    return scored
+
+
+def labelled_frames(
+    dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
+) -> Iterator[tuple[Frame, LabelledObjects]]:
+    """The frames of a data set, each with the labels that it is scored by; warnings and errors as `detect_dataset`."""
+    lacking: dict[str, list[str]] = {}
+    for index, _ in enumerate(track(dataset.names)):
+        sources = dataset.sources(index)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", FormatWarning)
+            frame = dataset.read(index)
+            truth = _labels(frame, sources)
         for one in caught:
             if issubclass(one.category, FormatWarning):
                 text = str(one.message)
-                lacking.setdefault(_kind(text, dataset.sources(index)), []).append(text)
+                lacking.setdefault(_kind(text, sources), []).append(text)
             else:
                 warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+        yield frame, truth
     for first, *others in lacking.values():
         likewise = f" Other frames likewise: {len(others)}." if others else ""
-        warnings.warn(first + likewise, FormatWarning, stacklevel=2)
+        warnings.warn(first + likewise, FormatWarning, stacklevel=3)
+
+
+def warn_of_dropped(frames: Sequence[ScoredFrame]) -> None:
+    """Warn of what was not used, summed over the frames, where there is anything."""
     dropped = _dropped(frames)
     if dropped:
-        warnings.warn(f"Dropped {'; '.join(dropped)}.", DroppedWarning, stacklevel=2)
-    return frames
+        warnings.warn(f"Dropped {'; '.join(dropped)}.", DroppedWarning, stacklevel=3)
+
+
+def score_frame(frame: Frame, truth: LabelledObjects, result: FrameResult) -> ScoredFrame:
+    """A frame of `labelled_frames` and its detections, made ready for evaluation."""
+    boxes = Boxes.from_array(result.boxes)
+    inside = np.asarray(points_in_boxes(frame.points, boxes)).sum(-1)
+    if frame.camera is not None:
+        rows, kept = result_rows(result, frame.camera)
+        found = detections_from_rows(rows)._replace(points=inside[kept])
+        return ScoredFrame(frame.name, truth, found, tuple(map(format_row, rows)), result)
+    found = DetectedObjects(result.labels, result.scores.astype(np.float64), boxes, points=inside)
+    lines = [
+        " ".join([*(f"{value:.4f}" for value in box), label, f"{score:.4f}"])
+        for box, label, score in zip(result.boxes, result.labels, result.scores, strict=True)
+    ]
+    return ScoredFrame(frame.name, truth, found, tuple(lines), result)
 
 
 def write_frames(frames: Sequence[ScoredFrame], folder: Pathlike) -> None:
@@ -97,23 +131,6 @@ def find_trained(workdir: Pathlike) -> Path:
         if (Path(workdir) / name).is_file():
             return Path(workdir) / name
     raise FormatError(f"{workdir} has neither {' nor '.join(TRAINED)}; name the folder of a training that saved some.")
-
-
-def _score_frame(detector: Detector, frame: Frame, sources: Iterable[Path]) -> ScoredFrame:
-    truth = _labels(frame, sources)
-    result = detect_in_view(detector, frame.points, frame.camera)
-    boxes = Boxes.from_array(result.boxes)
-    inside = np.asarray(points_in_boxes(frame.points, boxes)).sum(-1)
-    if frame.camera is not None:
-        rows, kept = result_rows(result, frame.camera)
-        found = detections_from_rows(rows)._replace(points=inside[kept])
-        return ScoredFrame(frame.name, truth, found, tuple(map(format_row, rows)), result)
-    found = DetectedObjects(result.labels, result.scores.astype(np.float64), boxes, points=inside)
-    lines = [
-        " ".join([*(f"{value:.4f}" for value in box), label, f"{score:.4f}"])
-        for box, label, score in zip(result.boxes, result.labels, result.scores, strict=True)
-    ]
-    return ScoredFrame(frame.name, truth, found, tuple(lines), result)
 
 
 def _labels(frame: Frame, sources: Iterable[Path]) -> LabelledObjects:

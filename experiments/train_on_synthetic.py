@@ -39,7 +39,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workdir", type=Path, required=True)
     parser.add_argument("--kitti", type=Path, help="real frames to score too")
-    parser.add_argument("--steps", type=int, default=4000)
+    parser.add_argument("--steps", type=int, default=5000)
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--held-out", type=int, default=HELD_OUT)
     options = parser.parse_args()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ciassd_jax import Config, Detector, init_variables, tiny
+from ciassd_jax.detector import bucket_of
 from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
 
 _PROGRAMS: dict[tuple[Config, int], Any] = {}
@@ -67,7 +68,7 @@ def share_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compile each program once for all detectors of this process."""
 
     def compile_once(self: Detector, num_points: int) -> Any:
-        key = self.config, self._bucket(num_points)
+        key = self.config, bucket_of(num_points)
         if key not in _PROGRAMS:
             _PROGRAMS[key] = _compile(self, num_points)
         return _PROGRAMS[key]

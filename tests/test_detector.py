@@ -140,7 +140,7 @@ def test_every_bucket_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("ciassd_jax.detector.predict", nothing)
     detector = Detector(random_variables(small_config()), small_config())
-    monkeypatch.setattr(detector, "smallest_bucket", 64)
+    monkeypatch.setattr("ciassd_jax.detector.SMALLEST_BUCKET", 64)
     for count in (1, 64, 63, 65, 256, 10, 257):
         assert detector(np.zeros((count, 4), np.float32)).counts["points"]["given"] == count
     assert traced == [(1, 64, 4), (1, 256, 4), (1, 1024, 4)]
