@@ -43,6 +43,13 @@ def find_frames(
     return [Frame(cloud, _find_camera(cloud, calib, image_size)) for cloud in clouds]
 
 
+def find_beside(cloud: Path, folder: str, suffix: str) -> Path | None:
+    """The file of the same frame in a folder beside that of the cloud, where it is there."""
+    # Absolute, as the cloud may be named from inside its folder.
+    path = cloud.absolute().parent.parent / folder / f"{cloud.stem}{suffix}"
+    return path if path.is_file() else None
+
+
 def detect_frame(detector: Detector, frame: Frame) -> FrameResult:
     """Read the points of a frame and detect; with a camera, only boxes in its view."""
     return detect_in_view(detector, read_points(frame.cloud), frame.camera)
@@ -128,8 +135,5 @@ def _find_calibration(cloud: Path, given: Pathlike | None) -> Path | None:
 
 
 def _beside(cloud: Path, folder: str, suffix: str) -> Path | None:
-    """The file of the same frame in another folder of a KITTI layout, where it is there."""
-    # Absolute, as the cloud may be named from inside its folder.
-    velodyne = cloud.absolute().parent
-    path = velodyne.parent / folder / f"{cloud.stem}{suffix}"
-    return path if velodyne.name.startswith("velodyne") and path.is_file() else None
+    """As `find_beside`, in KITTI's layout alone."""
+    return find_beside(cloud, folder, suffix) if cloud.absolute().parent.name.startswith("velodyne") else None

@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "ciassd_jax"
 LAYERS = [
-    {"types", "config", "training_config", "presets"},
+    {"types", "rebuilding", "config", "training_config", "presets"},
     {"ops", "formats"},
     {"model", "anchors", "targets", "losses", "detections", "data", "evaluation"},
     {

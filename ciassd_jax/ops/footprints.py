@@ -1,4 +1,4 @@
-"""Footprints of boxes on the ground: corners, collisions, and the points inside a box.
+"""Boxes and their footprints on the ground: corners, collisions, and the points inside a box.
 
 Written once for jax.numpy and NumPy, in the arrays' float type.
 """
@@ -28,6 +28,14 @@ def footprint_corners(boxes: Boxes) -> Float[Array, "*n 4 2"]:
         for front, left in ((1, 1), (-1, 1), (-1, -1), (1, -1))
     ]
     return xp.stack(corners, -2)
+
+
+def box_corners(boxes: Boxes) -> Float[Array, "*n 8 3"]:
+    """Corners (x, y, z) of boxes in metres: the footprint's at the bottom, then those above them."""
+    xp = np if isinstance(boxes.yaw, np.ndarray) else jnp
+    around, middle, half = footprint_corners(boxes), boxes.center[..., 2:, None], boxes.size[..., 2:, None] / 2
+    flat = xp.zeros_like(around[..., :1])
+    return xp.concatenate([xp.concatenate([around, flat + middle + side * half], -1) for side in (-1, 1)], -2)
 
 
 def footprints_collide(a: Boxes, b: Boxes) -> Bool[Array, "*n"]:

@@ -8,6 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ciassd_jax.ops.footprints import footprint_corners
+from ciassd_jax.types import Boxes
+from ciassd_jax.view.outlines import HEADING
 from ciassd_jax.view.sampling import choose_points, usable_boxes
 
 try:
@@ -97,21 +100,13 @@ def _usable(
 
 def _footprints(boxes: Float[np.ndarray, "D 7"]) -> Float[np.ndarray, "D 5 2"]:
     """The closed outline of each box on the ground."""
-    corners = np.array([(0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5), (0.5, 0.5)])
-    return _to_scene(boxes, corners[None] * boxes[:, None, 3:5])
-
-
-def _to_scene(boxes: Float[np.ndarray, "D 7"], offsets: Float[np.ndarray, "D n 2"]) -> Float[np.ndarray, "D n 2"]:
-    """Offsets along and across each box as positions (x, y)."""
-    cos, sin = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
-    along, across = offsets[..., 0], offsets[..., 1]
-    return boxes[:, None, :2] + np.stack([along * cos - across * sin, along * sin + across * cos], -1)
+    return np.asarray(footprint_corners(Boxes.from_array(boxes)))[:, (0, 1, 2, 3, 0)]
 
 
 def _draw_boxes(axes: Axes, boxes: Float[np.ndarray, "D 7"], color: str, zorder: int) -> None:
     """Outlines, and a line from each centre through the front."""
-    ahead = np.stack([boxes[:, 3] / 2 + 1.0, np.zeros(len(boxes))], -1)
-    heading = _to_scene(boxes, np.stack([np.zeros_like(ahead), ahead], 1))
+    ahead = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], -1) * (boxes[:, 3:4] / 2 + HEADING)
+    heading = boxes[:, None, :2] + np.stack([np.zeros_like(ahead), ahead], 1)
     for lines in (_footprints(boxes), heading):
         axes.add_collection(LineCollection(list(lines), colors=color, linewidths=1.6, zorder=zorder))
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-# Corners as fractions of (length, width, height): the four of the bottom counter-clockwise, then those above them.
-_CORNERS = np.array([(x, y, z) for z in (-0.5, 0.5) for x, y in ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))])
+from ciassd_jax.ops.footprints import box_corners
+from ciassd_jax.types import Boxes
+
+# Between the corners of `box_corners`, then the heading.
 _EDGES = np.array(
     [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7), (8, 9)]
 )
@@ -22,13 +24,10 @@ def outline_boxes(boxes: Float[np.ndarray, "D 7"]) -> Float64[np.ndarray, "D 13 
     `boxes` are x, y, z of the centre, length, width, height, yaw.
     """
     boxes = np.asarray(boxes, np.float64)
-    ends = np.zeros((len(boxes), 2, 3))
-    ends[:, 1, 0] = boxes[:, 3] / 2 + HEADING
-    ends[..., 2] = -boxes[:, None, 5] / 2
-    local = np.concatenate([_CORNERS * boxes[:, None, 3:6], ends], 1)
-    cos, sin = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
-    x, y, z = np.moveaxis(local, -1, 0)
-    points = boxes[:, None, :3] + np.stack([x * cos - y * sin, x * sin + y * cos, z], -1)
+    below = boxes[:, :3] - (0, 0, 0.5) * boxes[:, 3:6]
+    ahead = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), np.zeros(len(boxes))], -1)
+    front = below + ahead * (boxes[:, 3:4] / 2 + HEADING)
+    points = np.concatenate([box_corners(Boxes.from_array(boxes)), below[:, None], front[:, None]], 1)
     return points[:, _EDGES]
 
 

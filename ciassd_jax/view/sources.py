@@ -21,7 +21,7 @@ from ciassd_jax.formats.kitti import read_lines, read_rows, rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.predict_files import Frame as CloudFile
-from ciassd_jax.predict_files import find_frames
+from ciassd_jax.predict_files import find_beside, find_frames
 from ciassd_jax.view.frames import ViewFrame, frame_to_view
 
 # Folders of clouds, and where their labels lie beside them: KITTI's and OpenPCDet's custom layout.
@@ -56,7 +56,8 @@ def find_sources(path: Path, split: str = "all", image_size: tuple[int, int] | N
         )
     clouds = find_frames(path, image_size=image_size)
     return {
-        file.cloud.stem: Source(partial(_read_cloud, file), _beside(file.cloud, "image_2", ".png")) for file in clouds
+        file.cloud.stem: Source(partial(_read_cloud, file), find_beside(file.cloud, "image_2", ".png"))
+        for file in clouds
     }
 
 
@@ -109,7 +110,7 @@ def _read_cloud(file: CloudFile) -> ViewFrame:
     points = clean_points(read_points(file.cloud), file.cloud)
     frame = ViewFrame(file.cloud.stem, points, camera=file.camera)
     kind = _LABELS.get(file.cloud.absolute().parent.name)
-    path = _beside(file.cloud, kind, ".txt") if kind else None
+    path = find_beside(file.cloud, kind, ".txt") if kind else None
     if path is None:
         return frame
     if kind == "labels":
@@ -162,9 +163,3 @@ def _read_custom(path: Path) -> _Saved:
 
 def _existing(folder: Path | None, name: str) -> Path | None:
     return folder / name if folder is not None and (folder / name).is_file() else None
-
-
-def _beside(cloud: Path, folder: str, suffix: str) -> Path | None:
-    """The file of the same frame in another folder of the layout, where it is there."""
-    # Absolute, as the cloud may be named from inside its folder.
-    return _existing(cloud.absolute().parent.parent / folder, f"{cloud.stem}{suffix}")

@@ -7,7 +7,7 @@ import pytest
 import shapely
 from oracles_data import footprint, inside
 
-from ciassd_jax.ops.footprints import footprint_corners, footprints_collide, points_in_boxes
+from ciassd_jax.ops.footprints import box_corners, footprint_corners, footprints_collide, points_in_boxes
 from ciassd_jax.types import Boxes
 
 
@@ -86,6 +86,18 @@ def test_corners_go_round_from_the_front_left():
     expected = np.array([shapely.get_coordinates(footprint(box))[:4] for box in boxes])
     np.testing.assert_allclose(footprint_corners(Boxes.from_array(boxes)), expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(jax.jit(footprint_corners)(narrow(boxes)), expected, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_corners_of_a_box_stand_on_those_of_its_footprint(xp):
+    rows = random_boxes(np.random.default_rng(1), 6)
+    boxes = Boxes.from_array(xp.asarray(rows))
+    corners = np.asarray(box_corners(boxes))
+    around = np.asarray(footprint_corners(boxes))
+    half = rows[:, None, 5] / 2
+    np.testing.assert_array_equal(corners[..., :2], np.concatenate([around, around], 1))
+    np.testing.assert_allclose(corners[:, :4, 2], np.tile(rows[:, None, 2] - half, (1, 4)), rtol=1e-6)
+    np.testing.assert_allclose(corners[:, 4:, 2], np.tile(rows[:, None, 2] + half, (1, 4)), rtol=1e-6)
 
 
 def test_points_strictly_inside():

@@ -88,13 +88,18 @@ def _meet(ground: Ground, height: Array, fall: Array) -> Array:
 
 
 def _on_road(ground: Ground, x: Array, y: Array) -> Array:
-    cosine, sine = jnp.cos(ground.yaw), jnp.sin(ground.yaw)
-    along, across = x * cosine + y * sine, y * cosine - x * sine
+    along, across = _along_and_across(ground, x, y)
     return (jnp.abs(across - ground.middle) < ground.half_width) | (
         jnp.abs(along - ground.crossing) < ground.crossing_half
     )
 
 
 def _beyond(ground: Ground, x: Array, y: Array) -> Array:
+    across = _along_and_across(ground, x, y)[1]
+    return jnp.abs(across - ground.middle) > ground.half_width + ground.pavement
+
+
+def _along_and_across(ground: Ground, x: Array, y: Array) -> tuple[Array, Array]:
+    """A place in the directions of the road."""
     cosine, sine = jnp.cos(ground.yaw), jnp.sin(ground.yaw)
-    return jnp.abs(y * cosine - x * sine - ground.middle) > ground.half_width + ground.pavement
+    return x * cosine + y * sine, y * cosine - x * sine

@@ -8,6 +8,7 @@ from jaxtyping import Float64, Int
 from ciassd_jax.data.synthetic.objects import KINDS
 from ciassd_jax.formats.kitti import ObjectRow, boxes_to_rows, lidar_to_image
 from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.ops.footprints import box_corners
 from ciassd_jax.types import Boxes
 
 # Parts of an object that may be hidden for the occlusions 0 (visible), 1 (partly) and 2 (largely).
@@ -56,11 +57,7 @@ def _part_inside(
     boxes: Boxes, rows: list[ObjectRow], kept: Int[np.ndarray, " kept"], camera: Camera
 ) -> Float64[np.ndarray, " kept"]:
     """Which part of each projected box's area lies in the image."""
-    signs = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    offset = boxes.size[kept][:, None] * signs
-    cosine, sine = np.cos(boxes.yaw[kept])[:, None], np.sin(boxes.yaw[kept])[:, None]
-    turned = [offset[..., 0] * cosine - offset[..., 1] * sine, offset[..., 0] * sine + offset[..., 1] * cosine]
-    corners = boxes.center[kept][:, None] + np.stack([*turned, offset[..., 2]], -1)
+    corners = box_corners(Boxes(*(leaf[kept] for leaf in boxes)))
     ahead = np.concatenate([corners, np.ones_like(corners[..., :1])], -1) @ lidar_to_image(camera.calibration).T
     # A corner beside or behind the camera counts as just before it.
     pixels = ahead[..., :2] / np.maximum(ahead[..., 2:], _NEAREST_DEPTH)

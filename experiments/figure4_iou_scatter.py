@@ -1,0 +1,39 @@
+"""Figure 4: confidence against real overlap, before and after its rectification.
+
+    python experiments/run.py figure4_iou_scatter --data KITTI --preset car_released --weights cia_ssd.pth
+
+A point is a decoded box above the score threshold, before NMS; its overlap is the 3D IoU with the nearest object.
+Results: README.md.
+"""
+
+from __future__ import annotations
+
+from measuring import correlation, decode_all
+from plots import plot_scatter
+from report import Report
+from study import Study
+
+
+def run(study: Study) -> Report:
+    """Correlations of three quantities with the overlap; the first seed's boxes as a plot."""
+    config, dataset = study.config, study.validation()
+    decoded = [decode_all(variables, config, dataset) for variables in study.networks("full", config)]
+    exponent = config.detection.iou_exponent
+    quantities = {
+        "class probability c": [boxes.probability for boxes in decoded],
+        "predicted IoU": [boxes.predicted_iou for boxes in decoded],
+        f"rectified confidence c * iou^{exponent:g}": [boxes.confidence(exponent) for boxes in decoded],
+    }
+    rows = [
+        {
+            "quantity": title,
+            "PCC with the 3D overlap": [
+                correlation(value, boxes.overlap) for value, boxes in zip(values, decoded, strict=True)
+            ],
+        }
+        for title, values in quantities.items()
+    ]
+    notes = (f"{sum(len(boxes.overlap) for boxes in decoded):,} boxes of {len(dataset)} frames.",)
+    first = {title: values[0] for title, values in quantities.items()}
+    figure = plot_scatter(first, decoded[0].overlap)
+    return Report("Figure 4: confidence and overlap", rows, notes, {"": figure})

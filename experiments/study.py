@@ -1,0 +1,102 @@
+"""What every experiment works with: a folder of frames, a preset with a budget, and trainings that resume."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ciassd_jax import Config, load_weights, make_batches, open_dataset
+from ciassd_jax.config import DetectionConfig, HeadConfig, NeckConfig
+from ciassd_jax.data.batching import Batches
+from ciassd_jax.data.folders import database_path, find_database
+from ciassd_jax.data.frames import Dataset
+from ciassd_jax.detector import find_weights
+from ciassd_jax.fitting import Intervals, fit
+from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.prediction import variables_of
+from ciassd_jax.types import Variables
+
+Say = Callable[[str], object]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Where the frames are, what is trained on them, how often, and where everything is written.
+
+    `config` is the paper's method in full; its schedule is the budget. An experiment changes one part of it at a time.
+    With `weights` nothing is trained: those of a file are measured instead.
+    """
+
+    data: Path | None
+    out: Path
+    config: Config
+    seeds: int = 1
+    weights: Path | None = None
+    say: Say = print
+
+    def validation(self) -> Dataset:
+        """The frames that are scored."""
+        return open_dataset(self.data, "val")
+
+    def networks(self, variant: str, config: Config) -> list[Variables]:
+        """The trained network of a variant for each seed: one training each, which goes on where it was interrupted.
+
+        `variant` names its folder: experiments that train the same share it. Raises FormatError where the folder is of
+        another config or other data.
+        """
+        if self.weights is not None:
+            return [self._given(config)]
+        return [self._train(variant, config, seed) for seed in range(self.seeds)]
+
+    def _given(self, config: Config) -> Variables:
+        assert self.weights is not None
+        weights = load_weights(find_weights(self.weights))
+        if network_of(weights.config) != network_of(config):
+            raise FormatError(f"{self.weights} are weights of another network; give --preset its name.")
+        return weights.variables
+
+    def _train(self, variant: str, config: Config, seed: int) -> Variables:
+        folder = self.out / "trainings" / f"{variant}-seed{seed}"
+        self.say(f"{variant}, seed {seed}: training in {folder}.")
+        steps = config.schedule.total_steps
+        intervals = Intervals(log=min(100, steps), save=min(250, steps), evaluate=0, keep=1)
+        fitted = fit(config, self._batches(config, seed), folder, intervals=intervals, progress=True, say=self.say)
+        if fitted.stopped is not None:
+            self.say("Interrupted; the same command goes on.")
+            sys.exit(128 + fitted.stopped)
+        return variables_of(fitted.state)
+
+    def _batches(self, config: Config, seed: int) -> Batches:
+        dataset = open_dataset(self.data, "train")
+        database = None
+        if config.data.augmentation.paste:
+            places = [database_path(folder, "train") for folder in (self.data, self.out) if folder is not None]
+            database = find_database(dataset, places, say=self.say)
+        options: dict[str, Any] = {"seed": seed, "batch_size": config.schedule.batch_size, "database": database}
+        return make_batches(dataset, config, **options)
+
+
+def network_of(config: Config) -> tuple:
+    """What the weights depend on."""
+    stages = tuple(replace(stage, capacity=0) for stage in config.backbone.stages)
+    return config.grid.voxel_size, stages, config.backbone.out_channels, config.neck, config.head, config.class_names
+
+
+def with_neck(config: Config, kind: str) -> Config:
+    """The config with another neck."""
+    neck: NeckConfig = replace(config.neck, kind=kind)
+    return replace(config, neck=neck)
+
+
+def without_iou(config: Config) -> Config:
+    """The config without the IoU branch."""
+    head: HeadConfig = replace(config.head, predict_iou=False)
+    return replace(config, head=head)
+
+
+def with_detection(config: Config, **changes: Any) -> DetectionConfig:
+    """The config's post-processing with some fields changed."""
+    return replace(config.detection, **changes)

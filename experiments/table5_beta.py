@@ -1,0 +1,40 @@
+"""Table 5: accuracy and correlation against beta, the exponent of the predicted IoU in the confidence.
+
+    python experiments/run.py table5_beta --data KITTI --preset car_released --weights cia_ssd.pth
+
+Without DI-NMS, as in the paper. One set of raw predictions serves all betas; the correlation (PCC) is that of the
+confidence of every decoded box above the score threshold, before NMS, with its 3D IoU with the nearest object.
+Results: README.md.
+"""
+
+from __future__ import annotations
+
+from measuring import correlation, decode_all, precisions, score_settings
+from plots import plot_beta
+from report import Report
+from study import Study, with_detection
+
+BETAS = range(7)
+
+
+def run(study: Study) -> Report:
+    """Score the full network with every beta."""
+    config, dataset = study.config, study.validation()
+    settings = {str(beta): with_detection(config, nms="rotated", iou_exponent=float(beta)) for beta in BETAS}
+    networks = study.networks("full", config)
+    found = [score_settings(variables, config, settings, dataset) for variables in networks]
+    decoded = [decode_all(variables, config, dataset) for variables in networks]
+    rows = []
+    for beta in BETAS:
+        pcc = [correlation(boxes.confidence(beta), boxes.overlap) for boxes in decoded]
+        rows.append({"beta": beta, **precisions([one[str(beta)] for one in found]), "PCC": pcc})
+    notes = [_maximum(rows, "3D R40 moderate"), _maximum(rows, "PCC")]
+    notes.append(f"PCC over {sum(len(boxes.overlap) for boxes in decoded):,} boxes. The paper takes beta = 4.")
+    return Report("Table 5: beta", rows, notes, {"": plot_beta(rows, "3D R40 moderate")})
+
+
+def _maximum(rows: list[dict], column: str) -> str:
+    """Where a column is largest, on average over the seeds."""
+    means = [sum(row[column]) / len(row[column]) for row in rows]
+    best = max(range(len(rows)), key=means.__getitem__)
+    return f"{column} is largest at beta = {rows[best]['beta']}: {means[best]:.3f}, against {means[0]:.3f} at beta = 0."

@@ -1,0 +1,85 @@
+"""Table 6: how long a frame takes, in three parts.
+
+    python experiments/run.py table6_runtime --data KITTI --preset car --weights WEIGHTS
+
+Batch 1, five runs over the same frames, the median frame of each run. Pre-processing pads the cloud and voxelises it,
+the network goes from voxels to raw predictions, post-processing decodes, rectifies, suppresses and filters. Each part
+is a compiled program of its own that is waited for; `predict`, which is all of them as one, is in the last row.
+Results: README.md.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from plots import plot_bars
+from report import Report
+from study import Study
+
+from ciassd_jax import Config, PointCloud
+from ciassd_jax.data.frames import Frame
+from ciassd_jax.detector import ANYWHERE, pad_to_bucket
+from ciassd_jax.formats.kitti_camera import view_planes
+from ciassd_jax.model.detector import CIASSD
+from ciassd_jax.prediction import RawPredictions, postprocess, predict, voxelize_batch
+from ciassd_jax.types import SparseVoxels, Variables
+
+# Milliseconds a frame (issue of the paper's Table 6); its hardware: an Intel Xeon Silver and a TITAN Xp.
+PAPER = {"pre-processing": 2.84, "network": 24.33, "post-processing": 3.59}
+FRAMES, RUNS = 20, 5
+
+
+def run(study: Study) -> Report:
+    """Time the three parts on up to twenty frames."""
+    config, dataset = study.config, study.validation()
+    frames = [dataset.read(index) for index in range(min(FRAMES, len(dataset)))]
+    parts = parts_of(study.networks("full", config)[0], config)
+    runs = [[parts(frame) for frame in frames] for _ in range(RUNS + 1)]
+    # The first run compiled.
+    medians = {part: [float(np.median([one[part] for one in run])) for run in runs[1:]] for part in runs[0][0]}
+    whole = medians.pop("whole in one program")
+    medians["sum"] = [sum(values) for values in zip(*medians.values(), strict=True)]
+    medians["whole in one program"] = whole
+    paper: dict[str, float] = PAPER | {"sum": sum(PAPER.values())}
+    rows = [{"part": part, "milliseconds": values, "paper": paper.get(part)} for part, values in medians.items()]
+    notes = [
+        f"Median of {len(frames)} frames, mean and range of {RUNS} runs, batch 1.",
+        "The paper measured `car()` on a GPU (a TITAN Xp); the machine of this row is below.",
+    ]
+    return Report("Table 6: run time", rows, notes, {"": plot_bars(rows, "milliseconds")})
+
+
+def parts_of(variables: Variables, config: Config) -> Callable[[Frame], dict[str, float]]:
+    """A function that gives the milliseconds of each part on a frame."""
+    variables = jax.device_put(variables)
+    voxelize = jax.jit(partial(voxelize_batch, grid=config.grid))
+    finish = jax.jit(partial(postprocess, config=config))
+    whole = jax.jit(partial(predict, config=config))
+
+    @jax.jit
+    def network(variables: Variables, voxels: SparseVoxels) -> RawPredictions:
+        output: Any = CIASSD(config).apply(variables, voxels)
+        predictions, kept, dropped = output
+        return RawPredictions(predictions, voxels, kept, dropped)
+
+    def measure(frame: Frame) -> dict[str, float]:
+        planes = (ANYWHERE if frame.camera is None else view_planes(frame.camera))[None]
+        start = time.perf_counter()
+        cloud: PointCloud = pad_to_bucket(frame.points)
+        voxels = jax.block_until_ready(voxelize(cloud))
+        voxelized = time.perf_counter()
+        raw = jax.block_until_ready(network(variables, voxels))
+        predicted = time.perf_counter()
+        jax.device_get(finish(raw, cloud, frustum=planes))
+        finished = time.perf_counter()
+        jax.device_get(whole(variables, pad_to_bucket(frame.points), frustum=planes))
+        ended = time.perf_counter()
+        seconds = voxelized - start, predicted - voxelized, finished - predicted, ended - finished
+        return dict(zip((*PAPER, "whole in one program"), (1e3 * part for part in seconds), strict=True))
+
+    return measure

@@ -1,0 +1,226 @@
+"""Each table and figure of the paper run to its end with a handful of steps, and what their runner refuses."""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import run
+from measuring import correlation, decode_all, nearest_overlap
+from mini_folders import NAMES
+from mini_training import share_training_programs, write_data
+from PIL import Image
+from report import to_text
+from small import IMAGE_SIZE, random_variables, small_config
+
+from ciassd_jax import Boxes, Config, fitting, open_dataset, save_weights
+from ciassd_jax.training_config import AugmentationConfig
+
+TABLES = ["table3_data", "table4_modules", "table5_beta", "table6_runtime", "figure4_iou_scatter", "figure5_snapshots"]
+BUDGET = ["--preset", "tiny", "--budget", "2", "--batch-size", "2"]
+
+
+def mini_preset() -> Config:
+    """Some boxes pass the threshold after two steps."""
+    config = small_config()
+    return replace(
+        config,
+        data=replace(config.data, max_points=1024, max_paste_points=512),
+        detection=replace(config.detection, score_threshold=0.05, nms="paper"),
+        classes=(replace(config.classes[0], support_threshold=0.1),),
+    )
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = write_data(tmp_path_factory.mktemp("data"))
+    for name in NAMES:
+        Image.new("RGB", IMAGE_SIZE, "grey").save(root / f"training/image_2/{name}.png")
+    return root
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One folder for all, so that they share the training of the full network."""
+    return tmp_path_factory.mktemp("results")
+
+
+@pytest.fixture(autouse=True)
+def preset() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(run.PRESETS, "tiny", mini_preset)
+        share_training_programs(patch)
+        yield
+
+
+def columns_of(path: Path) -> dict[str, list]:
+    rows = json.loads(path.read_text())["rows"]
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_it_runs_to_its_end(name: str, root: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run.main([name, "--data", str(root), "--out", str(out), *BUDGET]) == 0, capsys.readouterr().err
+    page = (out / f"{name}.md").read_text()
+    assert f"run.py {name} --data" in page
+    columns = columns_of(out / f"{name}.json")
+    for column in columns.values():
+        assert f"| {to_text(column[0])} " in page
+    pictures = re.findall(r"\]\((.*\.png)\)", page)
+    assert pictures
+    for picture in pictures:
+        with Image.open(out / picture) as image:
+            assert np.asarray(image.convert("L")).std() > 1
+    if name == "figure5_snapshots":
+        assert pictures == ["figure5_snapshots_000000_above.png", "figure5_snapshots_000000_image.png"]
+
+
+def test_the_memory_of_necks_is_of_their_programs(out: Path) -> None:
+    assert run.main(["memory_of_necks", "--out", str(out), "--preset", "tiny"]) == 0
+    columns = columns_of(out / "memory_of_necks.json")
+    assert len(columns["neck"]) == 3
+    assert columns["predict more"][0] == columns["training step more"][0] == "+0 %"
+    assert columns["training step, MB"][2] > columns["training step, MB"][0] > 0
+
+
+def test_a_switch_changes_its_part_alone(out: Path) -> None:
+    assert run.main(["parts_of_variants", "--out", str(out), "--preset", "car"]) == 0
+    columns = columns_of(out / "parts_of_variants.json")
+    changed = dict(zip(columns["variant"], columns["other parameter trees"], strict=True))
+    assert changed == {
+        "the paper's": "none",
+        "neck: SECOND's": "neck",
+        # Its features have twice the channels.
+        "neck: SA-SSD's": "neck, head",
+        "no IoU branch": "head",
+        "beta 0": "none",
+        "rotated NMS": "none",
+        "none of Table 3's data": "none",
+    }
+    assert len(set(columns["backbone, GFLOP"])) == 1
+
+
+def test_an_interrupted_run_goes_on(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Killed after the first seed's training: that one is not trained again."""
+    command = ["figure4_iou_scatter", "--data", str(root), "--out", str(tmp_path), "--seeds", "2", *BUDGET]
+
+    def killed(config: Config, batches: object, workdir: Path, **options: object) -> fitting.Fitted:
+        if "seed1" in str(workdir):
+            raise KeyboardInterrupt
+        return fitting.fit(config, batches, workdir, **options)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr("study.fit", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run.main(command)
+    assert not (tmp_path / "figure4_iou_scatter.json").exists()
+    first = (tmp_path / "trainings/full-seed0/metrics.jsonl").read_bytes()
+    assert run.main(command) == 0
+    assert "Going on from step 2" in capsys.readouterr().out
+    assert (tmp_path / "trainings/full-seed0/metrics.jsonl").read_bytes() == first
+    assert len(columns_of(tmp_path / "figure4_iou_scatter.json")["PCC with the 3D overlap"][0]) == 2
+
+
+def test_results_of_another_config_are_refused(
+    root: Path, out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run.main(["parts_of_variants", "--out", str(tmp_path), "--preset", "tiny"]) == 0
+    capsys.readouterr()
+    assert run.main(["parts_of_variants", "--out", str(tmp_path), "--preset", "tiny", "--budget", "5"]) == 2
+    assert "settings.config.schedule.total_steps is 55680 there and 5 here" in capsys.readouterr().err
+    # A training of another config in the folder, results or not.
+    other = [*BUDGET, "--learning-rate", "0.5"]
+    assert run.main(["table5_beta", "--data", str(root), "--out", str(out), *BUDGET]) == 0
+    (out / "table5_beta.json").unlink()
+    assert run.main(["table5_beta", "--data", str(root), "--out", str(out), *other]) == 2
+    assert "is of another config: config.schedule.learning_rate" in capsys.readouterr().err
+
+
+def test_what_cannot_be_run_is_one_sentence(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run.main(["table9"])
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert all(name in error for name in run.EXPERIMENTS)
+    monkeypatch.delenv("KITTI_ROOT", raising=False)
+    weights = tmp_path / "weights.safetensors"
+    save_weights(weights, random_variables(small_config()), small_config())
+    for arguments, words in (
+        (["table5_beta"], "set KITTI_ROOT"),
+        (["table5_beta", "--data", "nowhere"], "nowhere has no folder training"),
+        (["table4_modules", "--data", str(root), "--weights", str(weights)], "leave out --weights"),
+        (["table5_beta", "--data", str(root), "--weights", str(weights), "--preset", "car"], "--preset"),
+    ):
+        assert run.main([*arguments, "--out", str(tmp_path / "out")]) == 2
+        error = capsys.readouterr().err
+        assert words in error
+        assert len(error.splitlines()) == 1
+    with pytest.raises(SystemExit):
+        run.main(["table5_beta", "--seeds", "0"])
+
+
+def test_given_weights_are_measured_without_training(root: Path, tmp_path: Path) -> None:
+    weights = tmp_path / "weights.safetensors"
+    save_weights(weights, random_variables(mini_preset()), mini_preset())
+    arguments = ["--data", str(root), "--out", str(tmp_path), "--preset", "tiny", "--weights", str(weights)]
+    assert run.main(["table5_beta", *arguments]) == 0
+    assert not (tmp_path / "trainings").exists()
+    assert columns_of(tmp_path / "table5_beta.json")["beta"] == list(range(7))
+
+
+def test_the_switches_of_table_3_are_all_that_there_are() -> None:
+    switches = {name for name, value in vars(AugmentationConfig()).items() if value is True}
+    assert switches == set(filter(None, run.table3_data.ROWS.values()))
+
+
+def test_decoded_boxes_are_those_above_the_threshold(root: Path) -> None:
+    """All of them, where detection stops at its capacity; and their confidence is the rectified one."""
+    config = mini_preset()
+    dataset = open_dataset(root, "val")
+    few = replace(config, detection=replace(config.detection, max_candidates=1))
+    decoded = decode_all(random_variables(config), few, dataset)
+    assert len(decoded.overlap) > 16
+    assert (decoded.probability >= config.detection.score_threshold).all()
+    assert ((decoded.overlap >= 0) & (decoded.overlap <= 1)).all()
+    np.testing.assert_array_equal(decoded.confidence(0), decoded.probability)
+    np.testing.assert_allclose(decoded.confidence(2), decoded.probability * decoded.predicted_iou**2)
+
+
+def test_the_overlap_is_that_with_the_nearest_object() -> None:
+    truth = Boxes.from_array(np.array([[10.0, 0, 0, 4, 2, 2, 0], [20, 0, 0, 4, 2, 2, 0]]))
+    boxes = Boxes.from_array(np.array([[11.0, 0, 0, 4, 2, 2, 0], [20, 0, 1, 4, 2, 2, 0], [14, 0, 0, 8.1, 2, 2, 0]]))
+    # The last one's nearest is the first, which it overlaps by 2.05 of 10.05 - 0 metres along.
+    expected = [3 / 5, 1 / 3, 2.05 / 10.05]
+    np.testing.assert_allclose(nearest_overlap(boxes, truth), expected, rtol=1e-9)
+
+
+def test_correlation() -> None:
+    values = np.array([0.1, 0.5, 0.4])
+    assert correlation(values, 2 * values + 1) == pytest.approx(1)
+    assert correlation(values, -values) == pytest.approx(-1)
+    assert np.isnan(correlation(values, np.ones(3)))
+    assert np.isnan(correlation(values[:1], values[:1]))
+
+
+@pytest.mark.parametrize(
+    ("cell", "text"),
+    [
+        (None, "-"),
+        ("SSFA", "SSFA"),
+        (1234567, "1,234,567"),
+        (54.434, "54.43"),
+        (0.12345, "0.123"),
+        ([50.0], "50.00"),
+        ([50.0, 52.0], "51.00 (50.00 to 52.00)"),
+        ([float("nan")], "-"),
+    ],
+)
+def test_text_of_a_cell(cell: object, text: str) -> None:
+    assert to_text(cell) == text  # type: ignore[arg-type]
