@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from mini_folders import NAMES, write_kitti, write_split
-from small import random_variables, small_config
+from small import compiling_quickly, random_variables, small_config
 
 from ciassd_jax import Config, fitting, make_batches, open_dataset
 from ciassd_jax.data.batching import Batches
@@ -53,6 +53,11 @@ def mini_fit(root: Path, workdir: Path, say: Callable[[str], object] = lambda te
     return fit(config, batches, workdir, **chosen)
 
 
+def _compile_quickly(run: Any, batch: Any) -> Any:
+    with compiling_quickly():
+        return _compile(run, batch)
+
+
 def share_training_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compile the step of a config once for all trainings of this process."""
 
@@ -60,11 +65,12 @@ def share_training_programs(monkeypatch: pytest.MonkeyPatch) -> None:
         # The step does not read how the data is made.
         key = replace(self.config, data=DataConfig()), batch.frame.sharding, len(batch.frame)
         if key not in _PROGRAMS:
-            _PROGRAMS[key] = _compile(self, batch)
+            _PROGRAMS[key] = _compile_quickly(self, batch)
         return _PROGRAMS[key]
 
     monkeypatch.setattr(fitting._Run, "_compile", compile_once)
 
 
 if __name__ == "__main__":
+    fitting._Run._compile = _compile_quickly  # type: ignore[method-assign]
     mini_fit(Path(sys.argv[1]), Path(sys.argv[2]))

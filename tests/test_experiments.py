@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import run
@@ -14,12 +15,15 @@ from mini_folders import NAMES
 from mini_training import share_training_programs, write_data
 from PIL import Image
 from report import to_text
-from small import IMAGE_SIZE, random_variables, small_config
+from small import IMAGE_SIZE, QUICK, compiling_quickly, random_variables, small_config
 
 from ciassd_jax import Boxes, Config, fitting, open_dataset, save_weights
+from ciassd_jax.prediction import postprocess, predict_raw
 from ciassd_jax.training_config import AugmentationConfig
 
 TABLES = ["table3_data", "table4_modules", "table5_beta", "table6_runtime", "figure4_iou_scatter", "figure5_snapshots"]
+NETWORK = jax.jit(predict_raw, static_argnames="config", compiler_options=QUICK)
+POSTPROCESSING = jax.jit(postprocess, static_argnames="config", compiler_options=QUICK)
 BUDGET = ["--preset", "tiny", "--budget", "2", "--batch-size", "2"]
 
 
@@ -52,6 +56,8 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def preset() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(run.PRESETS, "tiny", mini_preset)
+        patch.setattr("measuring._predict_raw", NETWORK)
+        patch.setattr("measuring._postprocess", POSTPROCESSING)
         share_training_programs(patch)
         yield
 
@@ -79,7 +85,8 @@ def test_it_runs_to_its_end(name: str, root: Path, out: Path, capsys: pytest.Cap
 
 
 def test_the_memory_of_necks_is_of_their_programs(out: Path) -> None:
-    assert run.main(["memory_of_necks", "--out", str(out), "--preset", "tiny"]) == 0
+    with compiling_quickly():
+        assert run.main(["memory_of_necks", "--out", str(out), "--preset", "tiny"]) == 0
     columns = columns_of(out / "memory_of_necks.json")
     assert len(columns["neck"]) == 3
     assert columns["predict more"][0] == columns["training step more"][0] == "+0 %"

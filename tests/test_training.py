@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small import random_scene, random_variables, small_cloud, small_config
+from small import QUICK, random_scene, random_variables, small_cloud, small_config
 
 from ciassd_jax import Config, car, create_train_state, make_batches, train_step
 from ciassd_jax.data.batching import finish_scenes
@@ -26,7 +26,7 @@ from ciassd_jax.training import learning_rate, make_optimizer, momentum
 from ciassd_jax.training_config import ScheduleConfig
 from ciassd_jax.types import Boxes, Scene
 
-step = jax.jit(train_step, static_argnames=("config", "axis_name"))
+step = jax.jit(train_step, static_argnames=("config", "axis_name"), compiler_options=QUICK)
 
 
 def short(config: Config, **changes: Any) -> Config:
