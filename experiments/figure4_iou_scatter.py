@@ -1,6 +1,6 @@
 """Figure 4: confidence against real overlap, before and after its rectification.
 
-    python experiments/run.py figure4_iou_scatter --data KITTI --preset car_released --weights cia_ssd.pth
+    python experiments/run.py figure4_iou_scatter --data KITTI --weights cia_ssd.pth
 
 A point is a decoded box above the score threshold, before NMS; its overlap is the 3D IoU with the nearest object.
 Results: README.md.

@@ -1,6 +1,6 @@
 """Figure 5: what is found, in the camera's image and from above; truth red, detections green.
 
-    python experiments/run.py figure5_snapshots --data KITTI --preset car_released --weights cia_ssd.pth
+    python experiments/run.py figure5_snapshots --data KITTI --weights cia_ssd.pth
 
 Six frames, evenly spread over val. Frames without an image are drawn from above only. Results: README.md.
 """

@@ -30,15 +30,17 @@ import table6_runtime
 from report import Report, check_results, facts_of_run, to_markdown, write_report
 from study import Study
 
-from ciassd_jax import Config
+from ciassd_jax import Config, load_weights
 from ciassd_jax.__main__ import keep_programs
 from ciassd_jax.cli.messages import warnings_as_lines
 from ciassd_jax.data.folders import find_root
 from ciassd_jax.data.workers import WorkerError
+from ciassd_jax.detector import find_weights
 from ciassd_jax.fitting import TrainingError
 from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.presets import PRESETS
+from ciassd_jax.weights import Weights, check_fits
 
 
 class Experiment(NamedTuple):
@@ -79,21 +81,25 @@ def run(options: argparse.Namespace, command: str) -> None:
     if options.weights is not None and not experiment.takes_weights:
         raise FormatError(f"{options.name} compares networks that it trains itself; leave out --weights.")
     data = find_root(options.data) if experiment.takes_data else None
-    config = config_of(options)
+    weights = None if options.weights is None else load_weights(find_weights(options.weights))
+    config = config_of(options, weights)
+    if weights is not None:
+        check_fits(weights, config, options.weights)
     settings = settings_of(config, options, data)
     check_folder(options.out)
     check_results(options.out, options.name, settings)
+    given = None if weights is None else weights.variables
     start = time.perf_counter()
-    report = experiment.run(Study(data, options.out, config, options.seeds, options.weights))
+    report = experiment.run(Study(data, options.out, config, options.seeds, given))
     facts = facts_of_run(command, time.perf_counter() - start, options.seeds)
     write_report(report, options.out, options.name, settings, facts)
     print(to_markdown(report, facts))
     print(f"\nWritten to {options.out / options.name}.json, .md and .png.")
 
 
-def config_of(options: argparse.Namespace) -> Config:
-    """The preset with the budget as its schedule."""
-    config = PRESETS[options.preset]()
+def config_of(options: argparse.Namespace, weights: Weights | None) -> Config:
+    """The preset, or the config of the weights, with the budget as its schedule."""
+    config = weights.config if weights and not options.preset else PRESETS[options.preset or "car_lite"]()
     changes = {"total_steps": options.budget, "batch_size": options.batch_size, "learning_rate": options.learning_rate}
     given = {name: value for name, value in changes.items() if value is not None}
     return replace(config, schedule=replace(config.schedule, **given))
@@ -114,7 +120,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("name", choices=EXPERIMENTS)
     parser.add_argument("--data", type=Path, help="folder in KITTI's layout; KITTI_ROOT without it")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder of trainings and results (results)")
-    parser.add_argument("--preset", choices=PRESETS, default="car_lite")
+    parser.add_argument("--preset", choices=PRESETS, help="what is changed (that of the weights, or car_lite)")
     parser.add_argument("--seeds", type=_positive, default=1, help="trainings of each variant (1)")
     parser.add_argument("--budget", type=_positive, help="steps of each training (the preset's)")
     parser.add_argument("--batch-size", type=_positive, help="scenes a step (the preset's)")

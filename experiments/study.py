@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ciassd_jax import Config, load_weights, make_batches, open_dataset
+from ciassd_jax import Config, make_batches, open_dataset
 from ciassd_jax.config import DetectionConfig, HeadConfig, NeckConfig
 from ciassd_jax.data.batching import Batches
 from ciassd_jax.data.folders import database_path, find_database
 from ciassd_jax.data.frames import Dataset
-from ciassd_jax.detector import find_weights
 from ciassd_jax.fitting import Intervals, fit
-from ciassd_jax.formats.errors import FormatError
 from ciassd_jax.prediction import variables_of
 from ciassd_jax.types import Variables
 
@@ -27,14 +25,14 @@ class Study:
     """Where the frames are, what is trained on them, how often, and where everything is written.
 
     `config` is the paper's method in full; its schedule is the budget. An experiment changes one part of it at a time.
-    With `weights` nothing is trained: those of a file are measured instead.
+    With `weights` nothing is trained: they are measured instead.
     """
 
     data: Path | None
     out: Path
     config: Config
     seeds: int = 1
-    weights: Path | None = None
+    weights: Variables | None = None
     say: Say = print
 
     def validation(self) -> Dataset:
@@ -48,15 +46,8 @@ class Study:
         another config or other data.
         """
         if self.weights is not None:
-            return [self._given(config)]
+            return [self.weights]
         return [self._train(variant, config, seed) for seed in range(self.seeds)]
-
-    def _given(self, config: Config) -> Variables:
-        assert self.weights is not None
-        weights = load_weights(find_weights(self.weights))
-        if network_of(weights.config) != network_of(config):
-            raise FormatError(f"{self.weights} are weights of another network; give --preset its name.")
-        return weights.variables
 
     def _train(self, variant: str, config: Config, seed: int) -> Variables:
         folder = self.out / "trainings" / f"{variant}-seed{seed}"
@@ -77,12 +68,6 @@ class Study:
             database = find_database(dataset, places, say=self.say)
         options: dict[str, Any] = {"seed": seed, "batch_size": config.schedule.batch_size, "database": database}
         return make_batches(dataset, config, **options)
-
-
-def network_of(config: Config) -> tuple:
-    """What the weights depend on."""
-    stages = tuple(replace(stage, capacity=0) for stage in config.backbone.stages)
-    return config.grid.voxel_size, stages, config.backbone.out_channels, config.neck, config.head, config.class_names
 
 
 def with_neck(config: Config, kind: str) -> Config:

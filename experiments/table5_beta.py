@@ -1,6 +1,6 @@
 """Table 5: accuracy and correlation against beta, the exponent of the predicted IoU in the confidence.
 
-    python experiments/run.py table5_beta --data KITTI --preset car_released --weights cia_ssd.pth
+    python experiments/run.py table5_beta --data KITTI --weights cia_ssd.pth
 
 Without DI-NMS, as in the paper. One set of raw predictions serves all betas; the correlation (PCC) is that of the
 confidence of every decoded box above the score threshold, before NMS, with its 3D IoU with the nearest object.

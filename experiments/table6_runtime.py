@@ -1,6 +1,6 @@
 """Table 6: how long a frame takes, in three parts.
 
-    python experiments/run.py table6_runtime --data KITTI --preset car --weights WEIGHTS
+    python experiments/run.py table6_runtime --data KITTI --weights WEIGHTS
 
 Batch 1, five runs over the same frames, the median frame of each run. Pre-processing pads the cloud and voxelises it,
 the network goes from voxels to raw predictions, post-processing decodes, rectifies, suppresses and filters. Each part

@@ -94,7 +94,7 @@ def test_the_memory_of_necks_is_of_their_programs(out: Path) -> None:
 
 
 def test_a_switch_changes_its_part_alone(out: Path) -> None:
-    assert run.main(["parts_of_variants", "--out", str(out), "--preset", "car"]) == 0
+    assert run.main(["parts_of_variants", "--out", str(out), "--preset", "tiny"]) == 0
     columns = columns_of(out / "parts_of_variants.json")
     changed = dict(zip(columns["variant"], columns["other parameter trees"], strict=True))
     assert changed == {
@@ -176,7 +176,7 @@ def test_what_cannot_be_run_is_one_sentence(
 def test_given_weights_are_measured_without_training(root: Path, tmp_path: Path) -> None:
     weights = tmp_path / "weights.safetensors"
     save_weights(weights, random_variables(mini_preset()), mini_preset())
-    arguments = ["--data", str(root), "--out", str(tmp_path), "--preset", "tiny", "--weights", str(weights)]
+    arguments = ["--data", str(root), "--out", str(tmp_path), "--weights", str(weights)]
     assert run.main(["table5_beta", *arguments]) == 0
     assert not (tmp_path / "trainings").exists()
     assert columns_of(tmp_path / "table5_beta.json")["beta"] == list(range(7))
