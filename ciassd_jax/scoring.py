@@ -68,7 +68,8 @@ def detect_dataset(
             warnings.filterwarnings("ignore", "Dropped ", DroppedWarning)
             result = detect_in_view(detector, frame.points, frame.camera)
         scored.append(score_frame(frame, truth, result))
-    warn_of_dropped(scored)
+    if dropped := describe_dropped(scored):
+        warnings.warn(dropped, DroppedWarning, stacklevel=2)
     return scored
 
 
@@ -95,11 +96,10 @@ def labelled_frames(
         warnings.warn(first + likewise, FormatWarning, stacklevel=3)
 
 
-def warn_of_dropped(frames: Sequence[ScoredFrame]) -> None:
-    """Warn of what was not used, summed over the frames, where there is anything."""
+def describe_dropped(frames: Sequence[ScoredFrame]) -> str:
+    """A sentence on what was not used, summed over the frames; empty where nothing was lost."""
     dropped = _dropped(frames)
-    if dropped:
-        warnings.warn(f"Dropped {'; '.join(dropped)}.", DroppedWarning, stacklevel=3)
+    return f"Dropped {'; '.join(dropped)}." if dropped else ""
 
 
 def score_frame(frame: Frame, truth: LabelledObjects, result: FrameResult) -> ScoredFrame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -16,12 +17,12 @@ from ciassd_jax.config import DetectionConfig
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.data.scenes import target_labels
 from ciassd_jax.detections import select_candidates
-from ciassd_jax.detector import ANYWHERE, frame_result, pad_to_bucket
+from ciassd_jax.detector import ANYWHERE, DroppedWarning, frame_result, pad_to_bucket
 from ciassd_jax.evaluation import Evaluation
 from ciassd_jax.formats.kitti_camera import view_planes
 from ciassd_jax.ops.iou import iou_3d
 from ciassd_jax.prediction import postprocess, predict_raw
-from ciassd_jax.scoring import labelled_frames, score_frame, score_frames, warn_of_dropped
+from ciassd_jax.scoring import describe_dropped, labelled_frames, score_frame, score_frames
 from ciassd_jax.types import Candidates, PointCloud, Predictions, Variables
 
 _predict_raw = jax.jit(predict_raw, static_argnames="config")
@@ -55,8 +56,9 @@ def score_settings(
         for name, setting in settings.items():
             batch = _postprocess(raw, cloud, replace(config, detection=setting), frustum=planes[None])
             scored[name].append(score_frame(frame, truth, frame_result(batch, config, 0.0)))
-    for frames in scored.values():
-        warn_of_dropped(frames)
+    # Most settings lose the same.
+    for dropped in sorted({describe_dropped(frames) for frames in scored.values()} - {""}):
+        warnings.warn(dropped, DroppedWarning, stacklevel=2)
     return {name: score_frames(frames) for name, frames in scored.items()}
 
 

@@ -51,9 +51,11 @@ def plot_beta(rows: Sequence[Mapping[str, Any]], column: str) -> Figure:
 def plot_scatter(quantities: Mapping[str, np.ndarray], overlap: np.ndarray) -> Figure:
     """A panel for each quantity: its value against the overlap of the same box."""
     figure = Figure(figsize=(4.2 * len(quantities), 4.2), dpi=130, layout="constrained")
+    # Dense clouds of thousands of points must not become one patch.
+    alpha = float(np.clip(400 / max(len(overlap), 1), 0.1, 0.7))
     for axes, (title, values) in zip(figure.subplots(1, len(quantities), sharey=True), quantities.items(), strict=True):
         axes.plot([0, 1], [0, 1], color=GREY, linewidth=0.8)
-        axes.plot(values, overlap, ".", markersize=2, alpha=0.25, color=BLUE, markeredgewidth=0)
+        axes.plot(values, overlap, "o", markersize=3.5, alpha=alpha, color=BLUE, markeredgewidth=0)
         axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xlabel=title)
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel("3D IoU with the nearest object")

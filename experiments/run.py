@@ -30,7 +30,7 @@ import table6_runtime
 from report import Report, check_results, facts_of_run, to_markdown, write_report
 from study import Study
 
-from ciassd_jax import Config, load_weights
+from ciassd_jax import Config, load_weights, open_dataset
 from ciassd_jax.__main__ import keep_programs
 from ciassd_jax.cli.messages import warnings_as_lines
 from ciassd_jax.data.folders import find_root
@@ -107,9 +107,9 @@ def config_of(options: argparse.Namespace, weights: Weights | None) -> Config:
 
 def settings_of(config: Config, options: argparse.Namespace, data: Path | None) -> dict[str, Any]:
     """What results in one folder must have in common; more seeds are welcome."""
-    settings: dict[str, Any] = {"config": json.loads(config.to_json())}
-    return settings | {
-        "data": None if data is None else str(data.resolve()),
+    return {
+        "config": json.loads(config.to_json()),
+        "data": None if data is None else {"folder": data.resolve().name, "val": len(open_dataset(data, "val"))},
         "weights": None if options.weights is None else str(options.weights),
     }
 
