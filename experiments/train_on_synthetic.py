@@ -26,7 +26,7 @@ class Cycle(NamedTuple):
 
 
 # The second goes on from the first on other streets. The first leaves its split val to look at.
-CYCLES = (Cycle(1, "train", 5000, 2e-3), Cycle(3, "trainval", 3500, 1e-3))
+CYCLES = (Cycle(1, "train", 5000, 2e-3), Cycle(3, "trainval", 2000, 1e-3))
 FRAMES = 2000
 HELD_OUT, HELD_OUT_SEED = 200, 2
 TRAINING = "--preset car_lite --batch-size 2 --evaluate-every 0 --seed 0"

@@ -84,13 +84,15 @@ def test_it_runs_to_its_end(name: str, root: Path, out: Path, capsys: pytest.Cap
         assert pictures == ["figure5_snapshots_000000_above.png", "figure5_snapshots_000000_image.png"]
 
 
-def test_the_memory_of_necks_is_of_their_programs(out: Path) -> None:
+def test_the_memory_of_necks_is_of_their_programs(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two of the three, as each takes two long compilations."""
+    monkeypatch.delitem(run.memory_of_necks.NECKS, "ssfa")
     with compiling_quickly():
         assert run.main(["memory_of_necks", "--out", str(out), "--preset", "tiny"]) == 0
     columns = columns_of(out / "memory_of_necks.json")
-    assert len(columns["neck"]) == 3
+    assert columns["neck"] == ["SECOND's, the baseline", "SA-SSD's"]
     assert columns["predict more"][0] == columns["training step more"][0] == "+0 %"
-    assert columns["training step, MB"][2] > columns["training step, MB"][0] > 0
+    assert columns["training step, MB"][1] > columns["training step, MB"][0] > 0
 
 
 def test_a_switch_changes_its_part_alone(out: Path) -> None:
