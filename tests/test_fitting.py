@@ -69,7 +69,10 @@ def whole(root: Path, programs: Path, tmp_path_factory: pytest.TempPathFactory) 
     """A run that nothing cut off, its folder and what it said."""
     workdir, said = tmp_path_factory.mktemp("whole") / "new", []
     validation = open_dataset(root, "val")
-    return mini_fit(root, workdir, said.append, validation=validation), workdir, said
+    # The same program as the other runs': another would have other bits.
+    with pytest.MonkeyPatch.context() as patch:
+        share_training_programs(patch)
+        return mini_fit(root, workdir, said.append, validation=validation), workdir, said
 
 
 def assert_same_bits(some: TrainState, others: TrainState) -> None:
