@@ -8,10 +8,12 @@ Results: README.md.
 
 from __future__ import annotations
 
-from measuring import correlation, decode_all
+from measuring import decode_all
 from plots import plot_scatter
 from report import Report
 from study import Study
+
+from ciassd_jax.evaluation.breakdown import pearson
 
 
 def run(study: Study) -> Report:
@@ -28,7 +30,7 @@ def run(study: Study) -> Report:
         {
             "quantity": title,
             "PCC with the 3D overlap": [
-                correlation(value, boxes.overlap) for value, boxes in zip(values, decoded, strict=True)
+                pearson(value, boxes.overlap) for value, boxes in zip(values, decoded, strict=True)
             ],
         }
         for title, values in quantities.items()

@@ -103,13 +103,6 @@ def nearest_overlap(boxes: Boxes, truth: Boxes) -> np.ndarray:
     return np.asarray(iou_3d(boxes, Boxes(*(leaf[nearest] for leaf in truth))))
 
 
-def correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Pearson's correlation; NaN where one of the two is constant, or there are fewer than two values."""
-    if len(first) < 2 or np.ptp(first) == 0 or np.ptp(second) == 0:
-        return float("nan")
-    return float(np.corrcoef(first, second)[0, 1])
-
-
 def precisions(evaluations: Sequence[Evaluation], name: str = "Car") -> dict[str, list[float]]:
     """AP in percent of one class by measure, one value for each evaluation: the paper's R11 first, then R40."""
     columns = {}

@@ -9,10 +9,12 @@ Results: README.md.
 
 from __future__ import annotations
 
-from measuring import correlation, decode_all, precisions, score_settings
+from measuring import decode_all, precisions, score_settings
 from plots import plot_beta
 from report import Report
 from study import Study, with_detection
+
+from ciassd_jax.evaluation.breakdown import pearson
 
 BETAS = range(7)
 
@@ -26,7 +28,7 @@ def run(study: Study) -> Report:
     decoded = [decode_all(variables, config, dataset) for variables in networks]
     rows = []
     for beta in BETAS:
-        pcc = [correlation(boxes.confidence(beta), boxes.overlap) for boxes in decoded]
+        pcc = [pearson(boxes.confidence(beta), boxes.overlap) for boxes in decoded]
         rows.append({"beta": beta, **precisions([one[str(beta)] for one in found]), "PCC": pcc})
     notes = [_maximum(rows, "3D R40 moderate"), _maximum(rows, "PCC")]
     notes.append(f"PCC over {sum(len(boxes.overlap) for boxes in decoded):,} boxes. The paper takes beta = 4.")

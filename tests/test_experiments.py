@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 import run
-from measuring import correlation, decode_all, nearest_overlap
+from measuring import decode_all, nearest_overlap
 from mini_folders import NAMES
 from mini_training import share_training_programs, write_data
 from PIL import Image
@@ -18,6 +18,7 @@ from report import to_text
 from small import IMAGE_SIZE, QUICK, compiling_quickly, random_variables, small_config
 
 from ciassd_jax import Boxes, Config, fitting, open_dataset, save_weights
+from ciassd_jax.evaluation.breakdown import pearson
 from ciassd_jax.prediction import postprocess, predict_raw
 from ciassd_jax.training_config import AugmentationConfig
 
@@ -212,10 +213,10 @@ def test_the_overlap_is_that_with_the_nearest_object() -> None:
 
 def test_correlation() -> None:
     values = np.array([0.1, 0.5, 0.4])
-    assert correlation(values, 2 * values + 1) == pytest.approx(1)
-    assert correlation(values, -values) == pytest.approx(-1)
-    assert np.isnan(correlation(values, np.ones(3)))
-    assert np.isnan(correlation(values[:1], values[:1]))
+    assert pearson(values, 2 * values + 1) == pytest.approx(1)
+    assert pearson(values, -values) == pytest.approx(-1)
+    assert np.isnan(pearson(values, np.ones(3)))
+    assert np.isnan(pearson(values[:1], values[:1]))
 
 
 @pytest.mark.parametrize(

@@ -51,9 +51,14 @@ def correlation(evaluand: Evaluand, name: str) -> float:
     best = np.zeros(len(evaluand.detections.frame))
     np.maximum.at(best, pairs.second[same], pairs.overlap[same])
     overlap, score = best[best > 0], evaluand.detections.score[best > 0]
-    if len(overlap) < 2 or np.ptp(overlap) == 0 or np.ptp(score) == 0:
+    return pearson(overlap, score)
+
+
+def pearson(first: np.ndarray, second: np.ndarray) -> float:
+    """Pearson's correlation; NaN for fewer than two values and where one of the two is constant."""
+    if len(first) < 2 or np.ptp(first) == 0 or np.ptp(second) == 0:
         return float("nan")
-    return float(np.corrcoef(overlap, score)[0, 1])
+    return float(np.corrcoef(first, second)[0, 1])
 
 
 def _rows(
