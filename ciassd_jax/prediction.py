@@ -47,6 +47,11 @@ def predict_raw(state_or_variables: Variables, cloud: PointCloud, config: Config
     """Voxelise and run the network in evaluation mode; `cloud` has a leading batch axis."""
     with jax.named_scope("voxelize"):
         voxels = voxelize_batch(cloud, config.grid)
+    return predict_voxels(state_or_variables, voxels, config)
+
+
+def predict_voxels(state_or_variables: Variables, voxels: SparseVoxels, config: Config) -> RawPredictions:
+    """Run the network in evaluation mode on a batch of voxelised scenes."""
     output: Any = CIASSD(config).apply(variables_of(state_or_variables), voxels)
     predictions, kept, dropped = output
     return RawPredictions(predictions, voxels, kept, dropped)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,10 +20,11 @@ from ciassd_jax.data.scenes import target_labels
 from ciassd_jax.detections import select_candidates
 from ciassd_jax.detector import ANYWHERE, DroppedWarning, frame_result, pad_to_bucket
 from ciassd_jax.evaluation import Evaluation
+from ciassd_jax.evaluation.objects import LabelledObjects
 from ciassd_jax.formats.kitti_camera import view_planes
 from ciassd_jax.ops.iou import iou_3d
-from ciassd_jax.prediction import postprocess, predict_raw
-from ciassd_jax.scoring import describe_dropped, labelled_frames, score_frame, score_frames
+from ciassd_jax.prediction import RawPredictions, postprocess, predict_raw
+from ciassd_jax.scoring import ScoredFrame, describe_dropped, labelled_frames, score_frame, score_frames
 from ciassd_jax.types import Candidates, PointCloud, Predictions, Variables
 
 _predict_raw = jax.jit(predict_raw, static_argnames="config")
@@ -45,43 +47,86 @@ class DecodedBoxes(NamedTuple):
         return self.probability * np.abs(self.predicted_iou) ** exponent
 
 
+class Seen(NamedTuple):
+    """A frame with its labels, its padded cloud and what the network says of it."""
+
+    frame: Frame
+    truth: LabelledObjects
+    cloud: PointCloud
+    raw: RawPredictions
+
+
 def score_settings(
     variables: Variables, config: Config, settings: Mapping[str, DetectionConfig], dataset: Dataset
 ) -> dict[str, Evaluation]:
     """The evaluation of every setting of the post-processing; all are given the same raw predictions."""
-    config = without_training(config)
-    scored: dict[str, list] = {name: [] for name in settings}
-    for frame, truth, cloud, raw in _raw_predictions(variables, config, dataset):
-        planes = ANYWHERE if frame.camera is None else view_planes(frame.camera)
-        for name, setting in settings.items():
-            batch = _postprocess(raw, cloud, replace(config, detection=setting), frustum=planes[None])
-            scored[name].append(score_frame(frame, truth, frame_result(batch, config, 0.0)))
-    # Most settings lose the same.
-    for dropped in sorted({describe_dropped(frames) for frames in scored.values()} - {""}):
-        warnings.warn(dropped, DroppedWarning, stacklevel=2)
-    return {name: score_frames(frames) for name, frames in scored.items()}
+    return _evaluate([_score(seen, config, settings) for seen in _predictions(variables, config, dataset)])
 
 
 def decode_all(variables: Variables, config: Config, dataset: Dataset) -> DecodedBoxes:
     """Every decoded box above the score threshold, however many."""
+    return _join([_decode(seen, config) for seen in _predictions(variables, config, dataset)])
+
+
+def score_and_decode(
+    variables: Variables, config: Config, settings: Mapping[str, DetectionConfig], dataset: Dataset
+) -> tuple[dict[str, Evaluation], DecodedBoxes]:
+    """What `score_settings` and `decode_all` give, from one pass of the network."""
+    scored, decoded = [], []
+    for seen in _predictions(variables, config, dataset):
+        scored.append(_score(seen, config, settings))
+        decoded.append(_decode(seen, config))
+    return _evaluate(scored), _join(decoded)
+
+
+def _predictions(variables: Variables, config: Config, dataset: Dataset) -> Iterator[Seen]:
+    config, variables = without_training(config), jax.device_put(variables)
+
+    def track(names: Sequence[str]) -> Iterable[str]:
+        return tqdm(names, unit="frame", leave=False, disable=None)
+
+    for frame, truth in labelled_frames(dataset, track):
+        cloud = pad_to_bucket(frame.points)
+        yield Seen(frame, truth, cloud, _predict_raw(variables, cloud, config))
+
+
+def _score(seen: Seen, config: Config, settings: Mapping[str, DetectionConfig]) -> dict[str, ScoredFrame]:
+    config = without_training(config)
+    planes = ANYWHERE if seen.frame.camera is None else view_planes(seen.frame.camera)
+    scored = {}
+    for name, setting in settings.items():
+        batch = _postprocess(seen.raw, seen.cloud, replace(config, detection=setting), frustum=planes[None])
+        scored[name] = score_frame(seen.frame, seen.truth, frame_result(batch, config, 0.0))
+    return scored
+
+
+def _evaluate(frames: Sequence[Mapping[str, ScoredFrame]]) -> dict[str, Evaluation]:
+    scored = {name: [frame[name] for frame in frames] for name in frames[0]}
+    # Most settings lose the same.
+    for dropped in sorted({describe_dropped(of_setting) for of_setting in scored.values()} - {""}):
+        warnings.warn(dropped, DroppedWarning, stacklevel=3)
+    return {name: score_frames(of_setting) for name, of_setting in scored.items()}
+
+
+@partial(jax.jit, static_argnames="config")
+def _candidates(predictions: Predictions, config: Config) -> Candidates:
     anchors, labels = make_anchors(config)
     every = replace(config.detection, iou_exponent=0.0, max_candidates=len(labels))
+    scene = jax.tree.map(lambda leaf: leaf[0], predictions)
+    return select_candidates(scene, anchors, labels, every)[0]
 
-    @jax.jit
-    def decode(predictions: Predictions) -> Candidates:
-        scene = jax.tree.map(lambda leaf: leaf[0], predictions)
-        return select_candidates(scene, anchors, labels, every)[0]
 
-    parts = []
-    for frame, _, _, raw in _raw_predictions(variables, config, dataset):
-        found: Any = jax.device_get(decode(raw.predictions))
-        found = jax.tree.map(lambda leaf, valid=found.valid: leaf[valid], found)
-        truth = target_boxes(frame, config)
-        if len(truth.yaw):
-            overlap = nearest_overlap(Boxes(*(leaf.astype(np.float64) for leaf in found.boxes)), truth)
-            parts.append((found.score, found.iou, overlap))
-    columns = [np.concatenate(column).astype(np.float64) for column in zip(*parts, strict=True)] if parts else []
-    return DecodedBoxes(*(columns or [np.zeros(0)] * 3))
+def _decode(seen: Seen, config: Config) -> DecodedBoxes:
+    found: Any = jax.device_get(_candidates(seen.raw.predictions, without_training(config)))
+    truth = target_boxes(seen.frame, config)
+    # Without an object there is nothing to overlap with.
+    found = jax.tree.map(lambda leaf: leaf[found.valid & (len(truth.yaw) > 0)].astype(np.float64), found)
+    overlap = nearest_overlap(found.boxes, truth) if len(found.score) else np.zeros(0)
+    return DecodedBoxes(found.score, found.iou, overlap)
+
+
+def _join(parts: Sequence[DecodedBoxes]) -> DecodedBoxes:
+    return DecodedBoxes(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def without_training(config: Config) -> Config:
@@ -117,17 +162,3 @@ def precisions(evaluations: Sequence[Evaluation], name: str = "Car") -> dict[str
         values = [evaluation.precision(name, metric, limit, recall) for evaluation in evaluations]  # type: ignore[arg-type]
         columns[title] = [0.0 if value is None else value[level] for value in values]
     return columns
-
-
-def _raw_predictions(
-    variables: Variables, config: Config, dataset: Dataset
-) -> Iterator[tuple[Frame, Any, PointCloud, Any]]:
-    """The frames with their labels, their padded cloud and what the network says of it."""
-    config, variables = without_training(config), jax.device_put(variables)
-
-    def track(names: Sequence[str]) -> Iterable[str]:
-        return tqdm(names, unit="frame", leave=False, disable=None)
-
-    for frame, truth in labelled_frames(dataset, track):
-        cloud = pad_to_bucket(frame.points)
-        yield frame, truth, cloud, _predict_raw(variables, cloud, config)

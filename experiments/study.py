@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ciassd_jax import Config, make_batches, open_dataset
-from ciassd_jax.config import DetectionConfig, HeadConfig, NeckConfig
+from ciassd_jax.config import DetectionConfig
 from ciassd_jax.data.batching import Batches
 from ciassd_jax.data.folders import database_path, find_database
 from ciassd_jax.data.frames import Dataset
@@ -72,14 +72,12 @@ class Study:
 
 def with_neck(config: Config, kind: str) -> Config:
     """The config with another neck."""
-    neck: NeckConfig = replace(config.neck, kind=kind)
-    return replace(config, neck=neck)
+    return replace(config, neck=replace(config.neck, kind=kind))
 
 
 def without_iou(config: Config) -> Config:
     """The config without the IoU branch."""
-    head: HeadConfig = replace(config.head, predict_iou=False)
-    return replace(config, head=head)
+    return replace(config, head=replace(config.head, predict_iou=False))
 
 
 def with_detection(config: Config, **changes: Any) -> DetectionConfig:

@@ -9,7 +9,7 @@ Results: README.md.
 
 from __future__ import annotations
 
-from measuring import decode_all, precisions, score_settings
+from measuring import precisions, score_and_decode
 from plots import plot_beta
 from report import Report
 from study import Study, with_detection
@@ -24,8 +24,9 @@ def run(study: Study) -> Report:
     config, dataset = study.config, study.validation()
     settings = {str(beta): with_detection(config, nms="rotated", iou_exponent=float(beta)) for beta in BETAS}
     networks = study.networks("full", config)
-    found = [score_settings(variables, config, settings, dataset) for variables in networks]
-    decoded = [decode_all(variables, config, dataset) for variables in networks]
+    found, decoded = zip(
+        *(score_and_decode(variables, config, settings, dataset) for variables in networks), strict=True
+    )
     rows = []
     for beta in BETAS:
         pcc = [pearson(boxes.confidence(beta), boxes.overlap) for boxes in decoded]

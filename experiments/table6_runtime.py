@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import numpy as np
@@ -25,9 +24,8 @@ from ciassd_jax import Config, PointCloud
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.detector import ANYWHERE, pad_to_bucket
 from ciassd_jax.formats.kitti_camera import view_planes
-from ciassd_jax.model.detector import CIASSD
-from ciassd_jax.prediction import RawPredictions, postprocess, predict, voxelize_batch
-from ciassd_jax.types import SparseVoxels, Variables
+from ciassd_jax.prediction import postprocess, predict, predict_voxels, voxelize_batch
+from ciassd_jax.types import Variables
 
 # Milliseconds a frame on a GPU.
 PAPER = {"pre-processing": 2.84, "network": 24.33, "post-processing": 3.59}
@@ -58,14 +56,9 @@ def parts_of(variables: Variables, config: Config) -> Callable[[Frame], dict[str
     """A function that gives the milliseconds of each part on a frame."""
     variables = jax.device_put(variables)
     voxelize = jax.jit(partial(voxelize_batch, grid=config.grid))
+    network = jax.jit(partial(predict_voxels, config=config))
     finish = jax.jit(partial(postprocess, config=config))
     whole = jax.jit(partial(predict, config=config))
-
-    @jax.jit
-    def network(variables: Variables, voxels: SparseVoxels) -> RawPredictions:
-        output: Any = CIASSD(config).apply(variables, voxels)
-        predictions, kept, dropped = output
-        return RawPredictions(predictions, voxels, kept, dropped)
 
     def measure(frame: Frame) -> dict[str, float]:
         planes = (ANYWHERE if frame.camera is None else view_planes(frame.camera))[None]

@@ -11,12 +11,24 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 from ciassd_jax.cli import main as ciassd
 
-FRAMES, HELD_OUT = 2000, 200
-TRAIN_SEED, HELD_OUT_SEED = 1, 2
-TRAINING = "--preset car_lite --steps 5000 --batch-size 2 --learning-rate 2e-3 --evaluate-every 0 --seed 0"
+FRAMES, HELD_OUT, HELD_OUT_SEED = 2000, 200, 2
+TRAINING = "--preset car_lite --batch-size 2 --evaluate-every 0 --seed 0"
+
+
+class Cycle(NamedTuple):
+    """One training from the weights of the one before, on scenes of its own."""
+
+    scenes_seed: int
+    split: str
+    steps: int
+    learning_rate: float
+
+
+CYCLES = (Cycle(1, "train", 5000, 2e-3), Cycle(3, "trainval", 4500, 1e-3))
 
 
 def run(*words: str | Path) -> None:
@@ -41,12 +53,17 @@ def main() -> None:
     parser.add_argument("--kitti", type=Path, help="real frames to score too")
     options = parser.parse_args()
 
-    scenes, held_out, workdir = (options.workdir / name for name in ("scenes", "held_out", "training"))
-    weights = options.workdir / "car_lite.safetensors"
-    simulate(scenes, FRAMES, TRAIN_SEED)
+    held_out, weights = options.workdir / "held_out", options.workdir / "car_lite.safetensors"
     simulate(held_out, HELD_OUT, HELD_OUT_SEED)
-    run("train", "--data", scenes, "--workdir", workdir, *TRAINING.split())
-    run("convert", workdir / "last.safetensors", weights, "--half")
+    trained: list[str | Path] = []
+    for number, cycle in enumerate(CYCLES, 1):
+        scenes, training = (options.workdir / f"{name}_{number}" for name in ("scenes", "training"))
+        simulate(scenes, FRAMES, cycle.scenes_seed)
+        rates = ("--steps", str(cycle.steps), "--learning-rate", str(cycle.learning_rate))
+        start = ("--init-from", trained[-1]) if trained else ()
+        run("train", "--data", scenes, "--split", cycle.split, "--workdir", training, *TRAINING.split(), *rates, *start)
+        trained.append(training / "last.safetensors")
+    run("convert", trained[-1], weights, "--half")
     run("eval", "--weights", weights, "--data", held_out, "--split", "trainval")
     if options.kitti is not None:
         run("eval", "--weights", weights, "--data", options.kitti)

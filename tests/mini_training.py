@@ -53,7 +53,8 @@ def mini_fit(root: Path, workdir: Path, say: Callable[[str], object] = lambda te
     return fit(config, batches, workdir, **chosen)
 
 
-def _compile_quickly(run: Any, batch: Any) -> Any:
+def compile_quickly(run: Any, batch: Any) -> Any:
+    """`fit` compiles with `QUICK` where this is in the place of its method."""
     with compiling_quickly():
         return _compile(run, batch)
 
@@ -65,12 +66,12 @@ def share_training_programs(monkeypatch: pytest.MonkeyPatch) -> None:
         # The step does not read how the data is made.
         key = replace(self.config, data=DataConfig()), batch.frame.sharding, len(batch.frame)
         if key not in _PROGRAMS:
-            _PROGRAMS[key] = _compile_quickly(self, batch)
+            _PROGRAMS[key] = compile_quickly(self, batch)
         return _PROGRAMS[key]
 
     monkeypatch.setattr(fitting._Run, "_compile", compile_once)
 
 
 if __name__ == "__main__":
-    fitting._Run._compile = _compile_quickly  # type: ignore[method-assign]
+    fitting._Run._compile = compile_quickly  # type: ignore[method-assign]
     mini_fit(Path(sys.argv[1]), Path(sys.argv[2]))

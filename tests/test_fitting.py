@@ -15,7 +15,15 @@ import jax
 import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
-from mini_training import STEPS, mini_batches, mini_config, mini_fit, share_training_programs, write_data
+from mini_training import (
+    STEPS,
+    compile_quickly,
+    mini_batches,
+    mini_config,
+    mini_fit,
+    share_training_programs,
+    write_data,
+)
 from small import random_variables
 
 from ciassd_jax import create_train_state, fitting, load_weights, open_dataset
@@ -69,9 +77,9 @@ def whole(root: Path, programs: Path, tmp_path_factory: pytest.TempPathFactory) 
     """A run that nothing cut off, its folder and what it said."""
     workdir, said = tmp_path_factory.mktemp("whole") / "new", []
     validation = open_dataset(root, "val")
-    # The same program as the other runs': another would have other bits.
     with pytest.MonkeyPatch.context() as patch:
-        share_training_programs(patch)
+        # The program of the other runs, but compiled here, so that this is said.
+        patch.setattr(fitting._Run, "_compile", compile_quickly)
         return mini_fit(root, workdir, said.append, validation=validation), workdir, said
 
 
