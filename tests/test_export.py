@@ -1,23 +1,19 @@
 """One artefact for all platforms: it lowers for each and runs here from its bytes."""
 
-from dataclasses import replace
-
 import jax
 import numpy as np
 from jax import export
+from small import random_variables, small_cloud, small_config
 
 from ciassd_jax.export import PLATFORMS, export_predict, run_exported
-from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import predict
-from ciassd_jax.presets import tiny
 from ciassd_jax.types import PointCloud
 
 
 def test_artefact_runs_from_its_bytes() -> None:
-    config = replace(tiny(), detection=replace(tiny().detection, nms="rotated"))  # Finds boxes even untrained.
-    variables = init_variables(jax.random.key(0), config)
-    rng = np.random.default_rng(0)
-    points = rng.uniform((0, -6.4, -3, 0), (12.8, 6.4, 1, 1), (2, 500, 4)).astype(np.float32)
+    config = small_config()
+    variables = random_variables(config)
+    points = np.stack([small_cloud(seed, 500) for seed in range(2)])
     cloud = PointCloud(points, np.array([500, 123], np.int32))
     artefact = export_predict(variables, config, num_points=500, batch=2)
     assert export.deserialize(bytearray(artefact)).platforms == PLATFORMS

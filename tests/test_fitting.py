@@ -1,7 +1,6 @@
 """The training loop: what it leaves in its folder, and that a run that was cut off ends with the same bits."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,7 +13,6 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 from mini_training import (
     STEPS,
     compile_quickly,
@@ -57,23 +55,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Programs on the disk, so that other processes need not compile them again."""
-    folder = tmp_path_factory.mktemp("programs")
-    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-    before = {name: getattr(jax.config, name) for name in names}
-    for name, value in zip(names, (str(folder), 0.0), strict=True):
-        jax.config.update(name, value)
-    # Whether there is a cache was decided when this process compiled first.
-    compilation_cache.reset_cache()
-    yield folder
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-
-
-@pytest.fixture(scope="module")
-def whole(root: Path, programs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Fitted, Path, list[str]]:
+def whole(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Fitted, Path, list[str]]:
     """A run that nothing cut off, its folder and what it said."""
     workdir, said = tmp_path_factory.mktemp("whole") / "new", []
     validation = open_dataset(root, "val")
@@ -167,13 +149,10 @@ def test_a_stopped_run_goes_on_with_the_same_bits(
 
 
 def test_a_killed_run_goes_on_with_the_same_bits(
-    whole: tuple[Fitted, Path, list[str]], root: Path, programs: Path, tmp_path: Path
+    whole: tuple[Fitted, Path, list[str]], root: Path, tmp_path: Path
 ) -> None:
     program = Path(__file__).with_name("mini_training.py")
-    caching = {"JAX_COMPILATION_CACHE_DIR": str(programs), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    process = subprocess.Popen(
-        [sys.executable, str(program), str(root), str(tmp_path)], env={**os.environ, **caching}, stderr=subprocess.PIPE
-    )
+    process = subprocess.Popen([sys.executable, str(program), str(root), str(tmp_path)], stderr=subprocess.PIPE)
     checkpoints, deadline = tmp_path / "checkpoints", time.monotonic() + 300
     # The next checkpoint may be half-written when the first is complete.
     while process.poll() is None and time.monotonic() < deadline:
