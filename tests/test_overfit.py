@@ -10,7 +10,7 @@ from ciassd_jax import Config, create_train_state, predict, train_step
 from ciassd_jax.ops.iou import iou_3d
 from ciassd_jax.types import Boxes, Scene
 
-STEPS, CARS, POINTS = 300, 2, 150
+STEPS, CARS, POINTS = 600, 2, 150
 
 
 def seen_scene(config: Config, seed: int) -> Scene:

@@ -1,6 +1,5 @@
 """The switches of the paper's Table 4: what is switched off leaves everything else as it was."""
 
-from dataclasses import replace
 from functools import partial
 from math import prod
 
@@ -10,19 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small import QUICK, random_scene, random_variables, small_config
+from study import with_neck, without_iou
 
 from ciassd_jax import Config, car, create_train_state, train_step
 from ciassd_jax.info import count_flops, count_parameters
 from ciassd_jax.model.detector import init_variables
 from ciassd_jax.prediction import postprocess, predict_raw
-
-
-def with_neck(config: Config, kind: str) -> Config:
-    return replace(config, neck=replace(config.neck, kind=kind))
-
-
-def without_iou(config: Config) -> Config:
-    return replace(config, head=replace(config.head, predict_iou=False))
 
 
 def shapes_of(config: Config) -> dict:
