@@ -190,6 +190,19 @@ def test_the_switches_of_table_3_are_all_that_there_are() -> None:
     assert switches == set(filter(None, run.table3_data.ROWS.values()))
 
 
+@pytest.mark.parametrize(
+    ("precisions", "verdict"),
+    [
+        ((2.0, 30.0, 30.0), "is confirmed"),
+        ((2.0, 30.0, 29.0), "is not confirmed: 3D R40 moderate falls with 'c'"),
+        ((0.0, 0.4, 0.0), "is neither confirmed nor refuted"),
+    ],
+)
+def test_the_order_of_table_4(precisions: tuple[float, ...], verdict: str) -> None:
+    rows = [{"modules": name, "3D R40 moderate": [value]} for name, value in zip("abc", precisions, strict=True)]
+    assert verdict in run.table4_modules._order(rows)
+
+
 def test_decoded_boxes_are_those_above_the_threshold(root: Path) -> None:
     """All of them, where detection stops at its capacity; and their confidence is the rectified one."""
     config = mini_preset()
