@@ -8,7 +8,7 @@ above. Three trainings a seed: rectification and NMS are ways of reading the sam
 
 from __future__ import annotations
 
-from measuring import precisions, score_settings
+from measuring import is_too_small, precisions, score_settings
 from plots import plot_bars
 from report import Report
 from study import Study, with_detection, with_neck, without_iou
@@ -51,7 +51,7 @@ def _order(rows: list[dict]) -> str:
     """Whether every row of the paper's table is better than the one before, on average over the seeds."""
     steps = [row for row in rows if not row["modules"].startswith("...")]
     means = [sum(row["3D R40 moderate"]) / len(row["3D R40 moderate"]) for row in steps]
-    if max(means) < 1:
+    if is_too_small(steps):
         return "The paper's order is neither confirmed nor refuted: no row reaches 1 %, the budget is too small."
     worse = [row["modules"] for row, mean, before in zip(steps[1:], means[1:], means, strict=False) if mean < before]
     if not worse:
