@@ -27,6 +27,8 @@ def plot_bars(rows: Sequence[Mapping[str, Any]], column: str) -> Figure:
     axes.set_yticks(places, names)
     axes.set_xlabel(column)
     axes.margins(x=0.12)
+    # Bars of no length at all need an axis too.
+    axes.set_xlim(0, None if means.any() else 1)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 
