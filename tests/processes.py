@@ -15,7 +15,9 @@ from pathlib import Path
 from devices import CONFIG, gradient_of, scenes
 
 # Not optimised at all, one update in float64 takes longer than its compilation.
-os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level={int(sys.argv[1] == 'update')}"
+os.environ["XLA_FLAGS"] = (
+    f"--xla_backend_optimization_level={int(sys.argv[1] == 'update')} --xla_cpu_use_fusion_emitters=false"
+)
 
 import jax
 import numpy as np

@@ -15,8 +15,8 @@ from ciassd_jax import Config, Detector, init_variables, tiny
 from ciassd_jax.detector import bucket_of
 from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
 
-# Tests that make few steps spend their time in the compiler, which takes half as long without its costly passes.
-QUICK = {"xla_backend_optimization_level": 0}
+# Tests that make few steps spend their time in the compiler, which takes a third of it without its costly passes.
+QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 _PROGRAMS: dict[tuple[Config, int], Any] = {}
 _compile = Detector.compile
 
