@@ -55,15 +55,15 @@ def main() -> None:
 
     held_out, weights = options.workdir / "held_out", options.workdir / "car_lite.safetensors"
     simulate(held_out, HELD_OUT, HELD_OUT_SEED)
-    trained: list[str | Path] = []
+    start: tuple[str | Path, ...] = ()
     for number, cycle in enumerate(CYCLES, 1):
         scenes, training = (options.workdir / f"{name}_{number}" for name in ("scenes", "training"))
         simulate(scenes, FRAMES, cycle.scenes_seed)
         rates = ("--steps", str(cycle.steps), "--learning-rate", str(cycle.learning_rate))
-        start = ("--init-from", trained[-1]) if trained else ()
         run("train", "--data", scenes, "--split", cycle.split, "--workdir", training, *TRAINING.split(), *rates, *start)
-        trained.append(training / "last.safetensors")
-    run("convert", trained[-1], weights, "--half")
+        last = training / "last.safetensors"
+        start = ("--init-from", last)
+    run("convert", last, weights, "--half")
     run("eval", "--weights", weights, "--data", held_out, "--split", "trainval")
     if options.kitti is not None:
         run("eval", "--weights", weights, "--data", options.kitti)
