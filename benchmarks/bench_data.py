@@ -23,9 +23,9 @@ import numpy as np
 
 from ciassd_jax import car, car_lite, make_batches, open_dataset
 from ciassd_jax.config import Config
-from ciassd_jax.data.batching import Rows, Stream, finish_scenes, host_batches
 from ciassd_jax.data.frames import Dataset
-from ciassd_jax.data.paste import PasteDatabase, build_database, fingerprint_of, open_database
+from ciassd_jax.data.gt_sampling import ObjectDatabase, build_database, fingerprint_of, open_database
+from ciassd_jax.data.loader import Rows, Stream, finish_scenes, host_batches
 
 SHARED = Path(__file__).parents[2] / "shared"
 WORKERS = (0, 2)
@@ -44,7 +44,7 @@ def measure(arguments: argparse.Namespace, next_batch: Callable[[], object]) -> 
 
 
 def measure_preset(
-    config: Config, dataset: Dataset, database: PasteDatabase, arguments: argparse.Namespace
+    config: Config, dataset: Dataset, database: ObjectDatabase, arguments: argparse.Namespace
 ) -> dict[str, str]:
     """Frames a second of each part."""
     rows, rates = Rows(Stream(dataset, config, 0, True, database), arguments.batch), {}

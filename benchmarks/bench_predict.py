@@ -19,10 +19,10 @@ import jax
 import numpy as np
 
 import ciassd_jax
+from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.formats import kitti
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.ops.camera import frustum_planes
-from ciassd_jax.presets import PRESETS
 
 SHARED = Path(__file__).parents[2] / "shared"
 

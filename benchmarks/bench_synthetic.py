@@ -18,7 +18,7 @@ from functools import partial
 
 import jax
 
-from ciassd_jax.data.synthetic import Lidar, frame_key, simulate
+from ciassd_jax.simulation import Lidar, frame_key, simulate
 
 
 def scenes_per_second(run: Callable[[int], object], number: int, repeats: int) -> list[float]:

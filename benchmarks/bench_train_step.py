@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 import ciassd_jax
-from ciassd_jax.presets import PRESETS
+from ciassd_jax.config.presets import PRESETS
 
 SHARED = Path(__file__).parents[2] / "shared"
 PLOT = Path(__file__).with_name("train_step.png")

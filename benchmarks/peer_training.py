@@ -231,7 +231,7 @@ def check(shared: Path, batch: int) -> bool:
     import optax
 
     import ciassd_jax
-    from ciassd_jax.weights import load_released_weights
+    from ciassd_jax.inference.weights import load_released_weights
 
     config = ciassd_jax.car()
     state = ciassd_jax.create_train_state(jax.random.key(0), config)

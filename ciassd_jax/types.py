@@ -77,7 +77,7 @@ class Scene(NamedTuple):
     objects_cut: Int[Array, "*b"]
 
 
-class PasteObjects(NamedTuple):
+class SampledObjects(NamedTuple):
     """Objects drawn from the ground-truth database for one scene, in the LiDAR frame and the order of the draw.
 
     Slot k holds an object where `valid`: for every class two rounds of as many slots as objects may be wanted. Point

@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 
 from ciassd_jax import car, open_dataset
 from ciassd_jax.data.frames import Frame
-from ciassd_jax.data.synthetic import open_synthetic
 from ciassd_jax.formats.writing import write_text
 from ciassd_jax.ops.footprints import points_in_boxes
+from ciassd_jax.simulation import open_synthetic
 
 RINGS = np.arange(0, 80, 10)
 LEVELS = ("easy", "moderate", "hard", "none")

@@ -13,7 +13,7 @@ from report import Report
 from study import Study
 
 from ciassd_jax import Boxes, Detector
-from ciassd_jax.predict_files import detect_in_view
+from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.view.bev import plot_bev
 from ciassd_jax.view.overlay import plot_overlay
 from ciassd_jax.view.sources import find_sources, read_source
@@ -30,7 +30,7 @@ def run(study: Study) -> Report:
     rows, figures = [], {}
     for index in sorted(set(np.linspace(0, len(dataset) - 1, FRAMES).astype(int).tolist())):
         frame = dataset.read(index)
-        result, truth = detect_in_view(detector, frame.points, frame.camera), target_boxes(frame, config)
+        result, truth = detector.detect(frame.points, frustum=frustum_of(frame.camera)), target_boxes(frame, config)
         found = Boxes.from_array(result.boxes.astype(np.float64))
         overlap = nearest_overlap(truth, found) if len(result) and len(truth.yaw) else np.zeros(len(truth.yaw))
         matched = int((overlap >= MATCHED).sum())

@@ -13,18 +13,21 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from ciassd_jax import Boxes, Config
-from ciassd_jax.anchors import make_anchors
 from ciassd_jax.config import DetectionConfig
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.data.scenes import target_labels
-from ciassd_jax.detections import select_candidates
-from ciassd_jax.detector import ANYWHERE, DroppedWarning, frame_result, pad_to_bucket
 from ciassd_jax.evaluation import Evaluation
 from ciassd_jax.evaluation.objects import LabelledObjects
+from ciassd_jax.formats.errors import DroppedWarning
 from ciassd_jax.formats.kitti_camera import view_planes
+from ciassd_jax.inference.detector import pad_to_bucket
+from ciassd_jax.inference.postprocess import postprocess, select_candidates
+from ciassd_jax.inference.results import frame_result
+from ciassd_jax.inference.scoring import ScoredFrame, describe_dropped, labelled_frames, score_frame, score_frames
+from ciassd_jax.model.anchors import make_anchors
+from ciassd_jax.model.network import RawPredictions, predict_raw
+from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.ops.iou import iou_3d
-from ciassd_jax.prediction import RawPredictions, postprocess, predict_raw
-from ciassd_jax.scoring import ScoredFrame, describe_dropped, labelled_frames, score_frame, score_frames
 from ciassd_jax.types import Candidates, PointCloud, Predictions, Variables
 
 _predict_raw = jax.jit(predict_raw, static_argnames="config")

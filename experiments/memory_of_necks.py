@@ -18,8 +18,8 @@ from report import Report
 from study import Study, with_neck
 
 from ciassd_jax import Boxes, Config, GroundTruth, PointCloud, Scene, create_train_state, train_step
-from ciassd_jax.detector import SMALLEST_BUCKET
-from ciassd_jax.info import compiled_memory, count_flops, count_parameters
+from ciassd_jax.inference.cost import compiled_memory, count_flops, count_parameters
+from ciassd_jax.inference.detector import SMALLEST_BUCKET
 
 NECKS = {"second": "SECOND's, the baseline", "ssfa": "SSFA", "sassd": "SA-SSD's"}
 PAPER = {"second": "+0 %", "ssfa": "+10 %", "sassd": "+27 %"}

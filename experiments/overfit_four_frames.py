@@ -15,8 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from ciassd_jax import car_lite, make_batches, open_dataset
-from ciassd_jax.fitting import Intervals, fit
-from ciassd_jax.validation import count_found
+from ciassd_jax.training.loop import Intervals, fit
+from ciassd_jax.training.validation import count_found
 
 FRAMES = ("000010", "000038", "000095", "000120")
 MODERATE = 1

@@ -18,7 +18,7 @@ from study import Study, with_detection, with_neck, without_iou
 from table3_data import ROWS, with_switches
 
 from ciassd_jax import Config, init_variables
-from ciassd_jax.info import PARTS, count_flops, count_parameters
+from ciassd_jax.inference.cost import PARTS, count_flops, count_parameters
 
 
 def run(study: Study) -> Report:

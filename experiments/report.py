@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ciassd_jax import __version__
-from ciassd_jax.checkpoint import first_difference
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.writing import replacing, write_text
+from ciassd_jax.training.checkpoint import first_difference
 
 # A value of a table: text, a number, one number for each seed, or nothing where it is not at hand.
 Cell = str | int | float | Sequence[float] | None
@@ -34,18 +34,18 @@ class Report(NamedTuple):
 
 
 def check_results(folder: Path, name: str, settings: dict[str, Any]) -> None:
-    """Raise FormatError where `folder` holds this experiment's results of other settings."""
+    """Raise InputError where `folder` holds this experiment's results of other settings."""
     path = folder / f"{name}.json"
     if not path.exists():
         return
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))["settings"]
     except (ValueError, LookupError, TypeError) as error:
-        raise FormatError(f"{path} is no result of an experiment; name another folder with --out.") from error
+        raise InputError(f"{path} is no result of an experiment; name another folder with --out.") from error
     settings = json.loads(json.dumps(settings))
     if saved != settings:
         difference = first_difference(saved, settings, "settings")
-        raise FormatError(f"{path} is of another run: {difference}; name another folder with --out.")
+        raise InputError(f"{path} is of another run: {difference}; name another folder with --out.")
 
 
 def write_report(report: Report, folder: Path, name: str, settings: dict[str, Any], facts: dict[str, Any]) -> None:

@@ -33,14 +33,13 @@ from study import Study
 from ciassd_jax import Config, load_weights, open_dataset
 from ciassd_jax.__main__ import keep_programs
 from ciassd_jax.cli.messages import warnings_as_lines
+from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.data.folders import find_root
 from ciassd_jax.data.workers import WorkerError
-from ciassd_jax.detector import find_weights
-from ciassd_jax.fitting import TrainingError
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.writing import check_folder
-from ciassd_jax.presets import PRESETS
-from ciassd_jax.weights import Weights, check_fits
+from ciassd_jax.inference.weights import Weights, check_fits, find_weights
+from ciassd_jax.training.loop import TrainingError
 
 
 class Experiment(NamedTuple):
@@ -69,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings_as_lines(options.data or "KITTI_ROOT"):
             run(options, shlex.join(["python", "experiments/run.py", *(arguments or sys.argv[1:])]))
-    except (FormatError, WorkerError, TrainingError, ValueError) as error:
+    except (InputError, WorkerError, TrainingError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
@@ -79,7 +78,7 @@ def run(options: argparse.Namespace, command: str) -> None:
     """Refuse what cannot be done, then do it and write it down."""
     experiment = EXPERIMENTS[options.name]
     if options.weights is not None and not experiment.takes_weights:
-        raise FormatError(f"{options.name} compares networks that it trains itself; leave out --weights.")
+        raise InputError(f"{options.name} compares networks that it trains itself; leave out --weights.")
     data = find_root(options.data) if experiment.takes_data else None
     weights = None if options.weights is None else load_weights(find_weights(options.weights))
     config = config_of(options, weights)

@@ -10,11 +10,11 @@ from typing import Any
 
 from ciassd_jax import Config, make_batches, open_dataset
 from ciassd_jax.config import DetectionConfig
-from ciassd_jax.data.batching import Batches
 from ciassd_jax.data.folders import database_path, find_database
 from ciassd_jax.data.frames import Dataset
-from ciassd_jax.fitting import Intervals, fit
-from ciassd_jax.prediction import variables_of
+from ciassd_jax.data.loader import Batches
+from ciassd_jax.model.network import variables_of
+from ciassd_jax.training.loop import Intervals, fit
 from ciassd_jax.types import Variables
 
 Say = Callable[[str], object]
@@ -42,7 +42,7 @@ class Study:
     def networks(self, variant: str, config: Config) -> list[Variables]:
         """The trained network of a variant for each seed: one training each, which goes on where it was interrupted.
 
-        `variant` names its folder: experiments that train the same share it. Raises FormatError where the folder is of
+        `variant` names its folder: experiments that train the same share it. Raises InputError where the folder is of
         another config or other data.
         """
         if self.weights is not None:
@@ -63,7 +63,7 @@ class Study:
     def _batches(self, config: Config, seed: int) -> Batches:
         dataset = open_dataset(self.data, "train")
         database = None
-        if config.data.augmentation.paste:
+        if config.data.augmentation.gt_sampling:
             places = [database_path(folder, "train") for folder in (self.data, self.out) if folder is not None]
             database = find_database(dataset, places, say=self.say)
         options: dict[str, Any] = {"seed": seed, "batch_size": config.schedule.batch_size, "database": database}

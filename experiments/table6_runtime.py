@@ -22,9 +22,12 @@ from study import Study
 
 from ciassd_jax import Config, PointCloud
 from ciassd_jax.data.frames import Frame
-from ciassd_jax.detector import ANYWHERE, pad_to_bucket
 from ciassd_jax.formats.kitti_camera import view_planes
-from ciassd_jax.prediction import postprocess, predict, predict_voxels, voxelize_batch
+from ciassd_jax.inference.detector import pad_to_bucket
+from ciassd_jax.inference.postprocess import postprocess
+from ciassd_jax.inference.predict import predict
+from ciassd_jax.model.network import predict_voxels, voxelize_batch
+from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.types import Variables
 
 # Milliseconds a frame on a GPU.

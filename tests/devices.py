@@ -28,8 +28,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding
 from small import random_scene, random_variables, small_config
 
 from ciassd_jax import create_train_state, train_step
-from ciassd_jax.checkpoint import Checkpoints
-from ciassd_jax.data.batching import LoaderState
+from ciassd_jax.data.loader import LoaderState
+from ciassd_jax.training.checkpoint import Checkpoints
 from ciassd_jax.types import Scene
 
 SCENES = 8

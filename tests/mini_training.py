@@ -10,15 +10,16 @@ import pytest
 from mini_folders import NAMES, write_kitti, write_split
 from small import compiling_quickly, random_variables, small_config
 
-from ciassd_jax import Config, fitting, make_batches, open_dataset
-from ciassd_jax.data.batching import Batches
+from ciassd_jax import Config, make_batches, open_dataset
+from ciassd_jax.config import DataConfig
 from ciassd_jax.data.folders import find_database
-from ciassd_jax.fitting import Fitted, Intervals, fit
-from ciassd_jax.training_config import DataConfig
+from ciassd_jax.data.loader import Batches
+from ciassd_jax.training import loop
+from ciassd_jax.training.loop import Fitted, Intervals, fit
 
 STEPS = 9
 _PROGRAMS: dict[Any, Any] = {}
-_compile = fitting._Run._compile
+_compile = loop._Run._compile
 INTERVALS = Intervals(log=1, save=2, evaluate=4, keep=2)
 
 
@@ -27,7 +28,7 @@ def mini_config(steps: int = STEPS) -> Config:
     config = small_config()
     return replace(
         config,
-        data=replace(config.data, max_points=1024, max_paste_points=512),
+        data=replace(config.data, max_points=1024, max_gt_sampling_points=512),
         schedule=replace(config.schedule, total_steps=steps, batch_size=2, ema_decay=0.9),
     )
 
@@ -69,9 +70,9 @@ def share_training_programs(monkeypatch: pytest.MonkeyPatch) -> None:
             _PROGRAMS[key] = compile_quickly(self, batch)
         return _PROGRAMS[key]
 
-    monkeypatch.setattr(fitting._Run, "_compile", compile_once)
+    monkeypatch.setattr(loop._Run, "_compile", compile_once)
 
 
 if __name__ == "__main__":
-    fitting._Run._compile = compile_quickly  # type: ignore[method-assign]
+    loop._Run._compile = compile_quickly  # type: ignore[method-assign]
     mini_fit(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -20,11 +20,11 @@ def collide(a: shapely.Polygon, b: shapely.Polygon) -> bool:
 
 
 def accept_by_loop(
-    truth: np.ndarray, boxes: np.ndarray, valid: np.ndarray, wanted: np.ndarray, paste_up_to: tuple[int, ...]
+    truth: np.ndarray, boxes: np.ndarray, valid: np.ndarray, wanted: np.ndarray, gt_sampling_up_to: tuple[int, ...]
 ) -> np.ndarray:
     """Which of the drawn boxes (O, 7) are pasted among the truth boxes (n, 7)."""
     placed, accepted, start = [footprint(box) for box in truth], np.zeros(len(boxes), bool), 0
-    for label, slots in enumerate(paste_up_to):
+    for label, slots in enumerate(gt_sampling_up_to):
         missing = int(wanted[label])
         for _ in range(2):
             draws = [slot for slot in range(start, start + slots) if valid[slot]][:missing]

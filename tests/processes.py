@@ -24,31 +24,32 @@ import numpy as np
 from mini_training import mini_config
 from small import random_variables, small_config
 
-from ciassd_jax import create_train_state, parallel, train_step
+from ciassd_jax import create_train_state, train_step
 from ciassd_jax.cli import main
-from ciassd_jax.presets import PRESETS
+from ciassd_jax.config.presets import PRESETS
+from ciassd_jax.training import distributed
 
 
 def update(out: Path) -> None:
     """An update of eight scenes, of which each process has its share."""
     jax.config.update("jax_enable_x64", True)
-    batch, (index, count) = scenes("one empty"), parallel.shard()
+    batch, (index, count) = scenes("one empty"), distributed.shard()
     share = len(batch.frame) // count
     rows = jax.tree.map(lambda leaf: leaf[index * share : (index + 1) * share], batch)
-    mesh = parallel.data_mesh(len(batch.frame))
+    mesh = distributed.data_mesh(len(batch.frame))
     wide = partial(jax.tree.map, lambda leaf: np.asarray(leaf, np.float64))
     state = create_train_state(jax.random.key(0), CONFIG, variables=wide(random_variables(small_config())))
-    step = parallel.shard_step(partial(train_step, config=CONFIG), mesh)
-    after, metrics = step(parallel.replicate(state, mesh), parallel.shard_batch(rows, mesh))
+    step = distributed.shard_step(partial(train_step, config=CONFIG), mesh)
+    after, metrics = step(distributed.replicate(state, mesh), distributed.shard_batch(rows, mesh))
     found = {"gradient": gradient_of(after), "params": after.params, "metrics": metrics}
-    if parallel.is_first():
+    if distributed.is_first():
         leaves = jax.tree_util.tree_leaves_with_path(jax.device_get(found))
         np.savez(out, **{jax.tree_util.keystr(path): leaf for path, leaf in leaves})
 
 
 def train(stop: int, arguments: list[str]) -> int:
     PRESETS["tiny"] = mini_config
-    place, taken = parallel.shard_batch, []
+    place, taken = distributed.shard_batch, []
 
     def shard_batch(*given):
         taken.append(None)
@@ -56,7 +57,7 @@ def train(stop: int, arguments: list[str]) -> int:
             signal.raise_signal(signal.SIGTERM)
         return place(*given)
 
-    parallel.shard_batch = shard_batch
+    distributed.shard_batch = shard_batch
     return main(["train", *arguments])
 
 
@@ -65,5 +66,5 @@ if __name__ == "__main__":
     if what == "train":
         sys.exit(train(int(first), others))
     if others:
-        parallel.connect(others[0], int(others[1]), int(others[2]))
+        distributed.connect(others[0], int(others[1]), int(others[2]))
     update(Path(first))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ciassd_jax import Config, Detector, init_variables, tiny
-from ciassd_jax.detector import bucket_of
+from ciassd_jax.inference.detector import bucket_of
 from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
 
 # Tests that make few steps spend their time in the compiler, which takes a third of it without its costly passes.

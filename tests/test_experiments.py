@@ -17,10 +17,12 @@ from PIL import Image
 from report import to_text
 from small import IMAGE_SIZE, QUICK, compiling_quickly, random_variables, small_config
 
-from ciassd_jax import Boxes, Config, fitting, open_dataset, save_weights
+from ciassd_jax import Boxes, Config, open_dataset, save_weights
+from ciassd_jax.config import AugmentationConfig
 from ciassd_jax.evaluation.breakdown import pearson
-from ciassd_jax.prediction import postprocess, predict_raw
-from ciassd_jax.training_config import AugmentationConfig
+from ciassd_jax.inference.postprocess import postprocess
+from ciassd_jax.model.network import predict_raw
+from ciassd_jax.training import loop
 
 TABLES = ["table3_data", "table4_modules", "table5_beta", "table6_runtime", "figure4_iou_scatter", "figure5_snapshots"]
 NETWORK = jax.jit(predict_raw, static_argnames="config", compiler_options=QUICK)
@@ -33,7 +35,7 @@ def mini_preset() -> Config:
     config = small_config()
     return replace(
         config,
-        data=replace(config.data, max_points=1024, max_paste_points=512),
+        data=replace(config.data, max_points=1024, max_gt_sampling_points=512),
         detection=replace(config.detection, score_threshold=0.05, nms="paper"),
         classes=(replace(config.classes[0], support_threshold=0.1),),
     )
@@ -119,10 +121,10 @@ def test_an_interrupted_run_goes_on(
     """Killed after the first seed's training: that one is not trained again."""
     command = ["figure4_iou_scatter", "--data", str(root), "--out", str(tmp_path), "--seeds", "2", *BUDGET]
 
-    def killed(config: Config, batches: object, workdir: Path, **options: object) -> fitting.Fitted:
+    def killed(config: Config, batches: object, workdir: Path, **options: object) -> loop.Fitted:
         if "seed1" in str(workdir):
             raise KeyboardInterrupt
-        return fitting.fit(config, batches, workdir, **options)  # type: ignore[arg-type]
+        return loop.fit(config, batches, workdir, **options)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patch:
         patch.setattr("study.fit", killed)

@@ -18,7 +18,7 @@ from ciassd_jax.cli.inference import Convert, Demo, Info, Predict
 from ciassd_jax.cli.messages import UsageError
 from ciassd_jax.cli.train import Train
 from ciassd_jax.cli.view import View
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 
 Command = (
     Annotated[Predict, tyro.conf.subcommand("predict")]
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = command.run()
         sys.stdout.flush()
         return code
-    except (FormatError, UsageError) as error:
+    except (InputError, UsageError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:

@@ -11,12 +11,12 @@ import tyro
 
 from ciassd_jax.cli.inference import Preset
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
-from ciassd_jax.formats.errors import FormatError
-from ciassd_jax.presets import PRESETS
+from ciassd_jax.config.presets import PRESETS
+from ciassd_jax.formats.errors import InputError
 
 if TYPE_CHECKING:
-    from ciassd_jax.check import PerfectScore
-    from ciassd_jax.data.findings import Finding, Report
+    from ciassd_jax.evaluation.check_scores import PerfectScore
+    from ciassd_jax.evaluation.findings import Finding, Report
 
 Root = Annotated[Path | None, tyro.conf.Positional]
 
@@ -37,8 +37,8 @@ class Check:
     """So many findings of a kind are listed, the others counted."""
 
     def run(self) -> int:
-        from ciassd_jax.check import find_imperfect, score_truth
-        from ciassd_jax.data.check import check_dataset
+        from ciassd_jax.evaluation.check_scores import find_imperfect, score_truth
+        from ciassd_jax.evaluation.dataset_check import check_dataset
 
         config = PRESETS[self.preset]()
         report = check_dataset(self.root, self.split, config=config, image_size=self.image_size, track=frames_with_bar)
@@ -68,8 +68,8 @@ class Prepare:
 
     def run(self) -> int:
         from ciassd_jax.data.folders import database_path, find_root, is_custom, open_dataset
+        from ciassd_jax.data.gt_sampling import build_database
         from ciassd_jax.data.kitti import write_reduced
-        from ciassd_jax.data.paste import build_database
         from ciassd_jax.formats.writing import check_folder
 
         root = find_root(self.root)
@@ -78,7 +78,7 @@ class Prepare:
         with warnings_as_lines(root):
             if self.reduce:
                 if is_custom(root):
-                    raise FormatError(f"{root} has no camera to crop clouds to; leave out --reduce.")
+                    raise InputError(f"{root} has no camera to crop clouds to; leave out --reduce.")
                 print(f"Wrote {write_reduced(root, self.image_size, frames_with_bar)} cropped clouds.")
             dataset = open_dataset(root, self.split, self.image_size)
             build_database(dataset, path, frames_with_bar)
@@ -100,7 +100,7 @@ class Synth:
     """Replace what an earlier `data synth` wrote there."""
 
     def run(self) -> int:
-        from ciassd_jax.data.synthetic import write_synthetic
+        from ciassd_jax.simulation import write_synthetic
 
         if self.frames < 1:
             raise UsageError(f"--frames {self.frames} makes no data set; ask for at least 1.")
@@ -140,13 +140,13 @@ class Submit:
     """The archive to write: OUT.zip."""
 
     def run(self) -> int:
+        from ciassd_jax.cli.submit import check_results, write_submission
         from ciassd_jax.formats.writing import check_folder
-        from ciassd_jax.submission import check_results, write_submission
 
         if self.out.suffix != ".zip":
-            raise FormatError(f"{self.out} must end in .zip; name the archive so.")
+            raise InputError(f"{self.out} must end in .zip; name the archive so.")
         if not self.results.is_dir():
-            raise FormatError(f"{self.results} is no folder; name the one that holds the results.")
+            raise InputError(f"{self.results} is no folder; name the one that holds the results.")
         check_folder(self.out.parent)
         problems = check_results(self.results)
         for problem in problems:
@@ -194,7 +194,7 @@ def _table(report: Report) -> list[str]:
 
 def _score_table(scores: Sequence[PerfectScore]) -> list[str]:
     """What the labels score as detections, and what that says where it is less than 100."""
-    from ciassd_jax.check import FULL_CURVE
+    from ciassd_jax.evaluation.check_scores import FULL_CURVE
 
     if not scores:
         return []

@@ -14,7 +14,7 @@ from ciassd_jax.cli.messages import UsageError, warnings_as_lines
 
 if TYPE_CHECKING:
     from ciassd_jax.evaluation import Evaluation
-    from ciassd_jax.scoring import ScoredFrame
+    from ciassd_jax.inference.scoring import ScoredFrame
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,10 @@ class Evaluate:
 
     def _network(self) -> int:
         from ciassd_jax.data.folders import find_root, open_dataset
-        from ciassd_jax.detector import Detector
         from ciassd_jax.evaluation import format_report
         from ciassd_jax.formats.writing import check_folder
-        from ciassd_jax.scoring import detect_dataset, score_frames
+        from ciassd_jax.inference.detector import Detector
+        from ciassd_jax.inference.scoring import detect_dataset, score_frames
 
         weights = load_as(self._weights(), self.preset)
         config = override(weights.config, None, self.score_threshold)
@@ -108,7 +108,7 @@ class Evaluate:
         return 0
 
     def _weights(self) -> Path:
-        from ciassd_jax.scoring import find_trained
+        from ciassd_jax.inference.scoring import find_trained
 
         if self.weights is not None and self.workdir is None:
             return self.weights
@@ -121,7 +121,7 @@ class Evaluate:
     def _write(self, frames: Sequence[ScoredFrame], evaluation: Evaluation) -> None:
         from ciassd_jax.evaluation import format_json, format_report
         from ciassd_jax.formats.writing import write_text
-        from ciassd_jax.scoring import write_frames
+        from ciassd_jax.inference.scoring import write_frames
 
         if self.out is not None:
             write_frames(frames, self.out)

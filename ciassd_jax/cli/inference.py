@@ -12,13 +12,14 @@ import tyro
 
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
 from ciassd_jax.config import Config
-from ciassd_jax.formats.errors import FormatError
-from ciassd_jax.presets import PRESETS
+from ciassd_jax.config.presets import PRESETS
+from ciassd_jax.formats.errors import InputError
 
 if TYPE_CHECKING:
-    from ciassd_jax.detector import Detector, FrameResult
-    from ciassd_jax.predict_files import Frame
-    from ciassd_jax.weights import Weights
+    from ciassd_jax.data.clouds import CloudFile
+    from ciassd_jax.inference.detector import Detector
+    from ciassd_jax.inference.results import FrameResult
+    from ciassd_jax.inference.weights import Weights
 
 Preset = Literal["car", "car_released", "car_lite", "three_class", "tiny"]
 
@@ -45,11 +46,11 @@ class Predict:
     """Class probability that a candidate needs (the preset's: 0.3)."""
 
     def run(self) -> int:
-        from ciassd_jax.detector import Detector
+        from ciassd_jax.data.clouds import find_clouds
         from ciassd_jax.formats.writing import check_folder
-        from ciassd_jax.predict_files import find_frames
+        from ciassd_jax.inference.detector import Detector
 
-        frames = find_frames(self.path, calib=self.calib, image_size=self.image_size)
+        frames = find_clouds(self.path, calib=self.calib, image_size=self.image_size)
         weights = load_as(self.weights, self.preset)
         config = override(weights.config, self.dtype, self.score_threshold)
         check_folder(self.out)
@@ -62,14 +63,16 @@ class Predict:
             print(f"Wrote {' and '.join(map(str, written))}.")
         return 0
 
-    def _frame(self, detector: Detector, frame: Frame) -> tuple[FrameResult, list[Path]]:
-        from ciassd_jax.predict_files import detect_frame, write_frame
+    def _frame(self, detector: Detector, frame: CloudFile) -> tuple[FrameResult, list[Path]]:
+        from ciassd_jax.formats.kitti_camera import frustum_of
+        from ciassd_jax.formats.points import read_points
+        from ciassd_jax.inference.results import write_result
 
         with warnings_as_lines(frame.cloud):
-            result = detect_frame(detector, frame)
-            return result, write_frame(frame, result, self.out)
+            result = detector.detect(read_points(frame.cloud), frustum=frustum_of(frame.camera))
+            return result, write_result(result, frame.cloud.stem, self.out, frame.camera)
 
-    def _folder(self, detector: Detector, frames: list[Frame]) -> None:
+    def _folder(self, detector: Detector, frames: list[CloudFile]) -> None:
         from tqdm.auto import tqdm
 
         boxes, seconds = 0, 0.0
@@ -101,12 +104,12 @@ class Convert:
 
     def run(self) -> int:
         from ciassd_jax.formats.writing import check_folder
-        from ciassd_jax.weights import load_released_weights, load_weights, save_weights
+        from ciassd_jax.inference.weights import load_released_weights, load_weights, save_weights
 
         if self.out.suffix != ".safetensors":
-            raise FormatError(f"{self.out} must end in .safetensors; name the output so.")
+            raise InputError(f"{self.out} must end in .safetensors; name the output so.")
         if self.out.resolve() == self.source.resolve():
-            raise FormatError(f"{self.out} is the input itself; name another output.")
+            raise InputError(f"{self.out} is the input itself; name another output.")
         check_folder(self.out.parent)
         weights = (load_weights if self.half else load_released_weights)(self.source)
         for row in weights.report:
@@ -131,14 +134,14 @@ class Info:
     """Print one JSON object."""
 
     def run(self) -> int:
-        from ciassd_jax import info
+        from ciassd_jax.inference import cost
 
         config = load_as(self.weights, self.preset).config if self.weights else PRESETS[self.preset or "car"]()
         facts = {
             "config": json.loads(config.to_json()),
-            "parameters": info.count_parameters(config),
-            "flops": info.count_flops(config),
-            "memory": info.compiled_memory(config, self.points),
+            "parameters": cost.count_parameters(config),
+            "flops": cost.count_flops(config),
+            "memory": cost.compiled_memory(config, self.points),
         }
         if self.json:
             print(json.dumps(facts))
@@ -172,7 +175,7 @@ class Demo:
     """Other seeds, other streets."""
 
     def run(self) -> int:
-        from ciassd_jax.demo import run_demo
+        from ciassd_jax.cli.demo import run_demo
 
         if self.scenes < 1:
             raise UsageError(f"--scenes {self.scenes} shows nothing; ask for at least 1.")
@@ -183,8 +186,7 @@ class Demo:
 
 def load_as(path: Path, preset: str | None) -> Weights:
     """The weights, with the preset's config in place of their own where one is asked for."""
-    from ciassd_jax.detector import find_weights
-    from ciassd_jax.weights import check_fits, load_weights
+    from ciassd_jax.inference.weights import check_fits, find_weights, load_weights
 
     weights = load_weights(find_weights(path))
     if preset is None:

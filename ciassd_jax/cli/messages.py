@@ -23,7 +23,7 @@ def warnings_as_lines(source: Path | str) -> Iterator[None]:
     """Show our own warnings as one line that names the input; leave all others as they are."""
     from tqdm.auto import tqdm
 
-    from ciassd_jax.detector import DroppedWarning
+    from ciassd_jax.formats.errors import DroppedWarning
 
     def show(message, category, *rest, **more):  # type: ignore[no-untyped-def]
         if issubclass(category, DroppedWarning | FormatWarning):

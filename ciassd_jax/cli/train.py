@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING, Any, Literal
 from ciassd_jax.cli.inference import Preset
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
 from ciassd_jax.config import Config
-from ciassd_jax.formats.errors import FormatError
-from ciassd_jax.presets import PRESETS
+from ciassd_jax.config.presets import PRESETS
+from ciassd_jax.formats.errors import InputError
 
 if TYPE_CHECKING:
-    from ciassd_jax.data.batching import Batches
     from ciassd_jax.data.frames import Dataset
-    from ciassd_jax.data.paste import PasteDatabase
-    from ciassd_jax.fitting import Intervals
+    from ciassd_jax.data.gt_sampling import ObjectDatabase
+    from ciassd_jax.data.loader import Batches
+    from ciassd_jax.training.loop import Intervals
     from ciassd_jax.types import Variables
 
 # Options that replace a field of the config's schedule.
-_SCHEDULE = ("batch_size", "kind", "learning_rate", "weight_decay", "accumulate", "ema_decay", "rematerialize")
+_SCHEDULE = ("batch_size", "kind", "learning_rate", "weight_decay", "accumulate", "ema_decay", "remat")
 # One frame is learnt by heart so; the running statistics of the batch norms need the last hundreds of steps to settle.
 _OVERFIT = {"total_steps": 800, "learning_rate": 1e-3, "batch_size": 1}
 
@@ -78,7 +78,7 @@ class Train:
     """Gradients of so many batches make one update (1)."""
     ema_decay: float | None = None
     """Decay of the running mean of the weights, which evaluation then uses (0: none)."""
-    rematerialize: bool | None = None
+    remat: bool | None = None
     """Compute activations again in the backward pass: less memory, more time."""
     log_every: int = 50
     """Steps between two lines of metrics.jsonl."""
@@ -101,9 +101,9 @@ class Train:
 
         from ciassd_jax.data.folders import find_root
         from ciassd_jax.data.workers import WorkerError
-        from ciassd_jax.fitting import TrainingError
         from ciassd_jax.formats.writing import check_folder
-        from ciassd_jax.parallel import ParallelError, connect, is_first
+        from ciassd_jax.training.distributed import ParallelError, connect, is_first
+        from ciassd_jax.training.loop import TrainingError
 
         root = find_root(self.data)
         check_folder(self.workdir)
@@ -116,7 +116,7 @@ class Train:
 
     def _train(self, root: Path, say: Any) -> int:
         from ciassd_jax.data.folders import open_dataset
-        from ciassd_jax.fitting import fit
+        from ciassd_jax.training.loop import fit
 
         dataset = open_dataset(root, self.split, self.image_size)
         validation = None
@@ -161,14 +161,14 @@ class Train:
         return replace(config, schedule=schedule, dtype=self.dtype or config.dtype)
 
     def _intervals(self) -> Intervals:
-        from ciassd_jax.fitting import Intervals
+        from ciassd_jax.training.loop import Intervals
 
         with _refused_as_usage():
             return Intervals(self.log_every, self.save_every, self.evaluate_every, self.keep)
 
-    def _batches(self, dataset: Dataset, config: Config, database: PasteDatabase | None) -> Batches:
-        from ciassd_jax.data.batching import make_batches
-        from ciassd_jax.parallel import shard
+    def _batches(self, dataset: Dataset, config: Config, database: ObjectDatabase | None) -> Batches:
+        from ciassd_jax.data.loader import make_batches
+        from ciassd_jax.training.distributed import shard
 
         with _refused_as_usage():
             return make_batches(
@@ -190,12 +190,12 @@ class Train:
             )
         return replace(dataset, names=(name,))
 
-    def _database(self, dataset: Dataset, config: Config, root: Path, say: Any) -> PasteDatabase | None:
+    def _database(self, dataset: Dataset, config: Config, root: Path, say: Any) -> ObjectDatabase | None:
         """The data set's own database, or one in the workdir; none where nothing is pasted."""
         from ciassd_jax.data.folders import database_path, find_database
-        from ciassd_jax.parallel import on_first
+        from ciassd_jax.training.distributed import on_first
 
-        pasted = config.data.augmentation.paste and any(one.paste_up_to for one in config.classes)
+        pasted = config.data.augmentation.gt_sampling and any(one.gt_sampling_up_to for one in config.classes)
         if self.overfit_one is not None or not pasted:
             return None
         places = [database_path(folder, self.split) for folder in (root, self.workdir)]
@@ -204,8 +204,7 @@ class Train:
         return on_first(find) or find()
 
     def _variables(self, config: Config) -> Variables | None:
-        from ciassd_jax.detector import find_weights
-        from ciassd_jax.weights import check_fits, load_weights
+        from ciassd_jax.inference.weights import check_fits, find_weights, load_weights
 
         if self.init_from is None:
             return None
@@ -214,8 +213,8 @@ class Train:
         return weights.variables
 
     def _report_overfit(self, state: Any, dataset: Dataset, config: Config, say: Any) -> int:
-        from ciassd_jax.parallel import on_first
-        from ciassd_jax.validation import count_found
+        from ciassd_jax.training.distributed import on_first
+        from ciassd_jax.training.validation import count_found
 
         found, targets = on_first(partial(count_found, state, dataset, config)) or (0, 0)
         say(f"Frame {self.overfit_one}: {found} of {targets} objects are found at a 3D overlap of 0.7.")
@@ -235,7 +234,7 @@ def _storage_silenced() -> Iterator[None]:
             warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
             try:
                 yield
-            except FormatError as error:
+            except InputError as error:
                 # Writes that were given up end a little later; causes and frames would keep them until the very end.
                 time.sleep(0.5)
                 error.__cause__ = error.__context__ = None

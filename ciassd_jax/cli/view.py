@@ -12,12 +12,12 @@ import tyro
 
 from ciassd_jax.cli.inference import load_as
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
-from ciassd_jax.formats.errors import FormatError, FormatWarning
+from ciassd_jax.formats.errors import FormatWarning, InputError
 
 if TYPE_CHECKING:
-    from ciassd_jax.detector import Detector
-    from ciassd_jax.view.frames import ViewFrame
+    from ciassd_jax.inference.detector import Detector
     from ciassd_jax.view.sources import Source
+    from ciassd_jax.view.view_frame import ViewFrame
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class View:
         if self.out.suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"--out {self.out} must end in .html; name the page so.")
         if self.results and not self.results.is_dir():
-            raise FormatError(f"{self.results} is no folder; name the one that holds the results.")
+            raise InputError(f"{self.results} is no folder; name the one that holds the results.")
 
     def _read(self) -> list[ViewFrame]:
         """The chosen frames with their detections."""
@@ -77,7 +77,7 @@ class View:
 
         sources = self._choose(find_sources(self.path, self.split, self.image_size))
         if self.image and not any(source.image for source in sources.values()):
-            raise FormatError(f"{self.path} has no images in image_2 beside its clouds; leave out --image.")
+            raise InputError(f"{self.path} has no images in image_2 beside its clouds; leave out --image.")
         detector = self._detector()
         frames = [read_source(sources[name], image=self.image) for name in frames_with_bar(list(sources))]
         if detector is not None:
@@ -99,7 +99,7 @@ class View:
     def _detector(self) -> Detector | None:
         if self.weights is None:
             return None
-        from ciassd_jax.detector import Detector
+        from ciassd_jax.inference.detector import Detector
 
         weights = load_as(self.weights, None)
         return Detector(weights.variables, weights.config)
@@ -107,11 +107,10 @@ class View:
 
 def _detect(detector: Detector, frame: ViewFrame) -> ViewFrame:
     """The frame with what the detector finds, where there is a camera only what it sees."""
-    from ciassd_jax.predict_files import detect_in_view
-    from ciassd_jax.view.frames import with_result
+    from ciassd_jax.formats.kitti_camera import frustum_of
 
     with warnings_as_lines(frame.name):
-        return with_result(frame, detect_in_view(detector, frame.points, frame.camera))
+        return detector.detect(frame.points, frustum=frustum_of(frame.camera)).show_in(frame)
 
 
 def _add_saved(frames: Sequence[ViewFrame], folder: Path) -> list[ViewFrame]:
@@ -121,7 +120,7 @@ def _add_saved(frames: Sequence[ViewFrame], folder: Path) -> list[ViewFrame]:
     found = [add_saved(frame, folder) for frame in frames]
     lacking = [frame.name for frame, with_saved in zip(frames, found, strict=True) if with_saved is None]
     if len(lacking) == len(frames):
-        raise FormatError(
+        raise InputError(
             f"{folder} has neither {lacking[0]}.json nor {lacking[0]}.txt nor one for another frame; "
             "name the folder that holds the results of these frames."
         )

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Bool, Float
 
-from ciassd_jax.config import Config
+from ciassd_jax.config import AugmentationConfig, Config
 from ciassd_jax.ops.footprints import footprint_corners, footprints_collide, points_in_boxes
-from ciassd_jax.training_config import AugmentationConfig
-from ciassd_jax.types import Array, Boxes, GroundTruth, PasteObjects, PointCloud, Scene
+from ciassd_jax.types import Array, Boxes, GroundTruth, PointCloud, SampledObjects, Scene
 
 
 def scene_key(seed: int | Array, epoch: int | Array, frame: int | Array) -> jax.Array:
@@ -22,7 +21,7 @@ def scene_key(seed: int | Array, epoch: int | Array, frame: int | Array) -> jax.
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), epoch), frame)
 
 
-def augment(key: jax.Array, scene: Scene, objects: PasteObjects, config: Config) -> Scene:
+def augment(key: jax.Array, scene: Scene, objects: SampledObjects, config: Config) -> Scene:
     """Augment one scene in the order of SPEC 2.2, as the switches of `config.data.augmentation` say.
 
     Obstacles keep objects apart and leave at the end. Each step has a key of its own: switching one off leaves
@@ -30,9 +29,9 @@ def augment(key: jax.Array, scene: Scene, objects: PasteObjects, config: Config)
     """
     switches = config.data.augmentation
     for_noise, for_transform, for_order = jax.random.split(key, 3)
-    paste_up_to = tuple(one.paste_up_to for one in config.classes)
-    if switches.paste and any(paste_up_to):
-        scene = paste_objects(scene, objects, paste_up_to=paste_up_to)
+    gt_sampling_up_to = tuple(one.gt_sampling_up_to for one in config.classes)
+    if switches.gt_sampling and any(gt_sampling_up_to):
+        scene = paste_objects(scene, objects, gt_sampling_up_to=gt_sampling_up_to)
     if switches.object_noise:
         scene = add_object_noise(for_noise, scene, switches)
     if switches.global_transform:
@@ -41,13 +40,13 @@ def augment(key: jax.Array, scene: Scene, objects: PasteObjects, config: Config)
     return keep_targets(scene, minimum=config.grid.minimum, maximum=config.grid.maximum)
 
 
-def paste_objects(scene: Scene, objects: PasteObjects, *, paste_up_to: tuple[int, ...]) -> Scene:
+def paste_objects(scene: Scene, objects: SampledObjects, *, gt_sampling_up_to: tuple[int, ...]) -> Scene:
     """Add the objects that collide with nothing, their points first; scene points inside them leave (SPEC 2.2, 2.3).
 
-    `paste_up_to` is the number of slots of one round for every class, not all 0. What finds no room is counted: an
-    object without a free box is not pasted, and points are cut from the end of the scene's.
+    `gt_sampling_up_to` is the number of slots of one round for every class, not all 0. What finds no room is counted:
+    an object without a free box is not pasted, and points are cut from the end of the scene's.
     """
-    accepted = accept_objects(scene.truth, objects, paste_up_to=paste_up_to)
+    accepted = accept_objects(scene.truth, objects, gt_sampling_up_to=gt_sampling_up_to)
     pasted = accepted & (scene.truth.count + jnp.cumsum(accepted) <= scene.truth.label.shape[0])
 
     points, capacity = scene.cloud.points, scene.cloud.points.shape[0]
@@ -69,7 +68,9 @@ def paste_objects(scene: Scene, objects: PasteObjects, *, paste_up_to: tuple[int
     )
 
 
-def accept_objects(truth: GroundTruth, objects: PasteObjects, *, paste_up_to: tuple[int, ...]) -> Bool[Array, " O"]:
+def accept_objects(
+    truth: GroundTruth, objects: SampledObjects, *, gt_sampling_up_to: tuple[int, ...]
+) -> Bool[Array, " O"]:
     """Which objects are pasted (SPEC 2.3): per class two rounds, the second of as many draws as are still wanted.
 
     Draws of a round are judged in order. One is out if it collides with a truth box, an accepted object or a later
@@ -84,7 +85,7 @@ def accept_objects(truth: GroundTruth, objects: PasteObjects, *, paste_up_to: tu
         return alive.at[slot].set(alive[slot] & ~blocked[slot] & ~jnp.any(collide[slot] & alive))
 
     alive, start = jnp.zeros_like(blocked), 0
-    for label, slots in enumerate(paste_up_to):
+    for label, slots in enumerate(gt_sampling_up_to):
         wanted = objects.wanted[label]
         for _ in range(2):
             stop = start + slots

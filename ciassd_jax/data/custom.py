@@ -10,7 +10,7 @@ import numpy as np
 
 from ciassd_jax.data.frames import Dataset, Frame, clean_points, difficulty_by_points
 from ciassd_jax.data.splits import Places, present_files, split_names
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.kitti import read_lines
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.ops.footprints import points_in_boxes
@@ -34,7 +34,7 @@ def open_custom(root: Path, split: str) -> Dataset:
 
 
 def read_custom_frame(name: str, *, root: Path) -> Frame:
-    """Read one frame; difficulty is by the number of points in a box. Raises FormatError for a malformed file."""
+    """Read one frame; difficulty is by the number of points in a box. Raises InputError for a malformed file."""
     path = root / PLACES["cloud"][0].format(name)
     points = clean_points(read_points(path), path)
     rows = read_custom_rows(root / PLACES["label"][0].format(name))
@@ -46,20 +46,20 @@ def read_custom_frame(name: str, *, root: Path) -> Frame:
 def read_custom_rows(path: Path) -> list[CustomRow]:
     """Read a label file of rows `x y z dx dy dz heading class`; an empty file holds no objects.
 
-    Raises FormatError, one sentence with file, line and remedy, for any other line.
+    Raises InputError, one sentence with file, line and remedy, for any other line.
     """
     return [parse_custom_row(line, place) for place, line in read_lines(path)]
 
 
 def parse_custom_row(line: str, place: str) -> CustomRow:
-    """Read one line; `place` names it in the FormatError for a line that is no row."""
+    """Read one line; `place` names it in the InputError for a line that is no row."""
     columns = line.split()
     if len(columns) != 8:
-        raise FormatError(f"{place}: {len(columns)} columns; a label has the 8 {_COLUMNS}, so write it again.")
+        raise InputError(f"{place}: {len(columns)} columns; a label has the 8 {_COLUMNS}, so write it again.")
     try:
         box = tuple(float(column) for column in columns[:7])
     except ValueError as error:
-        raise FormatError(f"{place}: {error}; write a number there.") from None
+        raise InputError(f"{place}: {error}; write a number there.") from None
     if not np.isfinite(box).all():
-        raise FormatError(f"{place}: a value is not finite; write a number there.")
+        raise InputError(f"{place}: a value is not finite; write a number there.")
     return CustomRow(box, columns[7])

@@ -8,16 +8,16 @@ from pathlib import Path
 
 from ciassd_jax.data.custom import open_custom
 from ciassd_jax.data.frames import Dataset
+from ciassd_jax.data.gt_sampling import ObjectDatabase, build_database, fingerprint_of, open_database
 from ciassd_jax.data.kitti import open_kitti
-from ciassd_jax.data.paste import PasteDatabase, build_database, fingerprint_of, open_database
-from ciassd_jax.formats.errors import FormatError, Pathlike
+from ciassd_jax.formats.errors import InputError, Pathlike
 
 
 def open_dataset(root: Pathlike | None, split: str, image_size: tuple[int, int] | None = None) -> Dataset:
     """The frames of a split in a KITTI folder, or in one of OpenPCDet's custom layout.
 
     Without `root` the environment's KITTI_ROOT is taken. `split` is train, val, trainval, test, "all", or the name of a
-    file in ROOT/ImageSets. `image_size` (width, height) stands in for that of KITTI's images. Raises FormatError, one
+    file in ROOT/ImageSets. `image_size` (width, height) stands in for that of KITTI's images. Raises InputError, one
     sentence with the remedy, for a folder or a split that is not there.
     """
     folder = find_root(root)
@@ -25,13 +25,13 @@ def open_dataset(root: Pathlike | None, split: str, image_size: tuple[int, int] 
 
 
 def find_root(root: Pathlike | None) -> Path:
-    """The folder, or the environment's KITTI_ROOT for None; raises FormatError if it has neither layout."""
+    """The folder, or the environment's KITTI_ROOT for None; raises InputError if it has neither layout."""
     given = root if root is not None else os.environ.get("KITTI_ROOT")
     if given is None:
-        raise FormatError("No data set is named; give its folder, or set KITTI_ROOT to it.")
+        raise InputError("No data set is named; give its folder, or set KITTI_ROOT to it.")
     folder = Path(given)
     if not any((folder / part).is_dir() for part in ("training", "testing", "points")):
-        raise FormatError(
+        raise InputError(
             f"{folder} has no folder training or testing (KITTI) or points (OpenPCDet's custom layout); check the path."
         )
     return folder
@@ -47,16 +47,16 @@ def find_database(
     places: Sequence[Path],
     progress: Callable[[range], Iterable[int]] = iter,
     say: Callable[[str], object] = print,
-) -> PasteDatabase:
+) -> ObjectDatabase:
     """The ground-truth database of a data set from the first of these files that belongs to it.
 
-    Where none does it is built in the last place. Raises FormatError for a frame or a place that cannot be used.
+    Where none does it is built in the last place. Raises InputError for a frame or a place that cannot be used.
     """
     fingerprint = fingerprint_of(dataset)
     for place in places:
         try:
             return open_database(place, fingerprint)
-        except FormatError:
+        except InputError:
             continue
     say(f"Collecting the objects to paste from {len(dataset)} frames into {places[-1]}.")
     build_database(dataset, places[-1], progress)

@@ -48,7 +48,7 @@ class Dataset:
         return len(self.names)
 
     def read(self, index: int) -> Frame:
-        """The frame with that place in `names`; raises FormatError for a file that cannot be used."""
+        """The frame with that place in `names`; raises InputError for a file that cannot be used."""
         return self.read_frame(self.names[index])
 
     def sources(self, index: int) -> tuple[Path, ...]:

@@ -12,7 +12,7 @@ from jaxtyping import Float32
 
 from ciassd_jax.data.frames import Dataset, Frame, clean_points
 from ciassd_jax.data.splits import Places, find_file, present_files, split_names
-from ciassd_jax.formats.errors import FormatError, FormatWarning
+from ciassd_jax.formats.errors import FormatWarning, InputError
 from ciassd_jax.formats.kitti import ObjectRow, read_rows, rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera, read_camera, view_planes
 from ciassd_jax.formats.kitti_difficulty import difficulty_of
@@ -56,7 +56,7 @@ def read_kitti_frame(
 ) -> Frame:
     """Read one frame; the full cloud is cropped to the camera's view where no reduced one is there.
 
-    Without labels there are no boxes. Raises FormatError for a file that is missing or malformed.
+    Without labels there are no boxes. Raises InputError for a file that is missing or malformed.
     """
     camera = read_camera(folder / f"calib/{name}.txt", folder / IMAGE.format(name), image_size)
     points = read_seen_points(folder, name, camera)
@@ -67,11 +67,11 @@ def read_kitti_frame(
 
 
 def read_objects(path: Path) -> list[ObjectRow]:
-    """The rows of a label file without DontCare; raises FormatError for a type that is none of KITTI's."""
+    """The rows of a label file without DontCare; raises InputError for a type that is none of KITTI's."""
     rows = [row for row in read_rows(path) if row.type != IGNORED]
     unknown = next((row.type for row in rows if row.type not in TYPES), None)
     if unknown is not None:
-        raise FormatError(f"{path}: the type '{unknown}' is none of KITTI's; write {', '.join(TYPES)} or {IGNORED}.")
+        raise InputError(f"{path}: the type '{unknown}' is none of KITTI's; write {', '.join(TYPES)} or {IGNORED}.")
     return rows
 
 
@@ -79,7 +79,7 @@ def read_seen_points(folder: Path, name: str, camera: Camera) -> Float32[np.ndar
     """The frame's reduced cloud, or its full one cropped to the camera's view."""
     path = find_file(folder, PLACES["cloud"], name)
     if path is None:
-        raise FormatError(f"{folder / FULL.format(name)} does not exist; copy it, or take the frame off the split.")
+        raise InputError(f"{folder / FULL.format(name)} does not exist; copy it, or take the frame off the split.")
     points = clean_points(read_points(path), path)
     return points if is_reduced(path) else crop_to_view(points, camera)
 
@@ -99,7 +99,7 @@ def write_reduced(
 ) -> int:
     """Write `velodyne_reduced` beside every full cloud that lacks it; returns how many were written.
 
-    `track` sees the clouds go by, for a progress bar. Raises FormatError for a file that cannot be read or written.
+    `track` sees the clouds go by, for a progress bar. Raises InputError for a file that cannot be read or written.
     """
     full = sorted(path for part in ("training", "testing") for path in (root / part).glob(FULL.format("*")))
     clouds = [path for path in full if not (path.parents[1] / REDUCED.format(path.stem)).is_file()]

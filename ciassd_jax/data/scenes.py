@@ -7,7 +7,7 @@ from jaxtyping import Int
 
 from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Frame
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
 
 OBSTACLE = -1
@@ -18,7 +18,7 @@ def pad_frame(frame: Frame, index: int, config: Config) -> Scene:
 
     An object is the target of the class with its name, or with `similar_classes` of the class that names it similar;
     every other object is an obstacle (label -1), and with `filter_scenes` one of no difficulty too. Points over
-    capacity are cut evenly from the whole cloud, boxes from the end. Raises FormatError for a box that is none.
+    capacity are cut evenly from the whole cloud, boxes from the end. Raises InputError for a box that is none.
     """
     _check_boxes(frame)
     data = config.data
@@ -62,7 +62,7 @@ def _check_boxes(frame: Frame) -> None:
     if not usable.all():
         index = int(np.argmin(usable))
         size = " x ".join(f"{edge:g}" for edge in frame.boxes.size[index])
-        raise FormatError(
+        raise InputError(
             f"Frame {frame.name}: object {index} ({frame.names[index]}) has the size {size} or a value that is not "
             "finite; mend or remove its line in the label file."
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ciassd_jax.formats.errors import FormatError, read_bytes
+from ciassd_jax.formats.errors import InputError, read_bytes
 
 # Where the files of a frame may lie, best place first: kind of file to paths with {} for the frame.
 Places = Mapping[str, Sequence[str]]
@@ -49,24 +49,24 @@ def official_split(split: str) -> tuple[str, ...] | None:
 def split_names(root: Path, split: str, folder: Path, places: Places) -> tuple[str, ...]:
     """Names of a split's frames (`listed_names`), each once and with its files in `folder`.
 
-    Raises FormatError for a split that is unknown, empty or names a frame twice, and for frames without their files.
+    Raises InputError for a split that is unknown, empty or names a frame twice, and for frames without their files.
     """
     names, source = listed_names(root, split, folder, places)
     if not names:
-        raise FormatError(f"{source} names no frame; check the path, or list them one a line.")
+        raise InputError(f"{source} names no frame; check the path, or list them one a line.")
     twice = repeated_names(names)
     if twice:
-        raise FormatError(f"{source}: {twice[0]}; list it once.")
+        raise InputError(f"{source}: {twice[0]}; list it once.")
     missing = missing_files(folder, places, names)
     if missing:
-        raise FormatError(f"{source}: {missing[0]}; copy them, or list those you have in {split_file(root, split)}.")
+        raise InputError(f"{source}: {missing[0]}; copy them, or list those you have in {split_file(root, split)}.")
     return names
 
 
 def listed_names(root: Path, split: str, folder: Path, places: Places) -> tuple[tuple[str, ...], str]:
     """Names of a split as they are listed, and where: `ImageSets/SPLIT.txt`, or the official list for KITTI's layout.
 
-    The split "all" is every frame that has a file in `folder`. Raises FormatError for a split that nothing lists.
+    The split "all" is every frame that has a file in `folder`. Raises InputError for a split that nothing lists.
     """
     path, official = split_file(root, split), official_split(split)
     if split == ALL:
@@ -74,7 +74,7 @@ def listed_names(root: Path, split: str, folder: Path, places: Places) -> tuple[
     if path.is_file():
         return tuple(read_bytes(path).decode("utf-8-sig", errors="replace").split()), str(path)
     if official is None or "calibration" not in places:
-        raise FormatError(f"{path} does not exist; write it, one frame a line, or take the split '{ALL}'.")
+        raise InputError(f"{path} does not exist; write it, one frame a line, or take the split '{ALL}'.")
     return official, f"The official list of {split}"
 
 

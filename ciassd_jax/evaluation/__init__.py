@@ -1,8 +1,8 @@
 """Evaluation by KITTI's official rules: NumPy in float64, without a device."""
 
-from ciassd_jax.evaluation.folders import read_folders
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
 from ciassd_jax.evaluation.report import format_block, format_json, format_report, format_tables, to_json
+from ciassd_jax.evaluation.result_folders import read_folders
 from ciassd_jax.evaluation.summary import Evaluation, evaluate
 
 __all__ = [

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float64, Int
 
-from ciassd_jax.formats.errors import FormatError, Pathlike, read_bytes
+from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes
 from ciassd_jax.types import Array, Boxes
 
 
@@ -68,7 +68,7 @@ _NEAREST_DEPTH = 0.001
 def read_calibration(path: Pathlike) -> Calibration:
     """Read P2, R0_rect and Tr_velo_to_cam (tracking: R_rect, Tr_velo_cam) by name, in float64.
 
-    Raises FormatError, one sentence with the remedy, for a line that is missing or is no such matrix.
+    Raises InputError, one sentence with the remedy, for a line that is missing or is no such matrix.
     """
     lines = {}
     for line in _read_text(path).splitlines():
@@ -78,14 +78,14 @@ def read_calibration(path: Pathlike) -> Calibration:
     for keys, shape in _MATRICES:
         found = [lines[key] for key in keys if key in lines]
         if not found:
-            raise FormatError(f"{path} has no line {keys[0]}; use the calibration file that KITTI gives for the frame.")
+            raise InputError(f"{path} has no line {keys[0]}; use the calibration file that KITTI gives for the frame.")
         try:
             matrix = np.array(found[0], np.float64).reshape(shape)
             usable = bool(np.isfinite(matrix).all()) and abs(np.linalg.det(matrix[:, :3])) > 1e-6
         except ValueError:
             usable = False
         if not usable:
-            raise FormatError(
+            raise InputError(
                 f"{path}, line {keys[0]}: not the {math.prod(shape)} numbers of an invertible matrix; "
                 "copy the file again."
             )
@@ -105,10 +105,10 @@ def image_size_for(calibration: Calibration) -> tuple[int, int] | None:
 
 
 def read_png_size(path: Pathlike) -> tuple[int, int]:
-    """Width and height in pixels from a PNG's header; raises FormatError if it is none."""
+    """Width and height in pixels from a PNG's header; raises InputError if it is none."""
     data = read_bytes(path, 24)
     if len(data) < 24 or data[:8] != b"\x89PNG\r\n\x1a\n" or data[12:16] != b"IHDR":
-        raise FormatError(f"{path} is no PNG image; give the frame's image_2 file or the image size.")
+        raise InputError(f"{path} is no PNG image; give the frame's image_2 file or the image size.")
     width, height = struct.unpack(">II", data[16:24])
     return width, height
 
@@ -116,7 +116,7 @@ def read_png_size(path: Pathlike) -> tuple[int, int]:
 def read_rows(path: Pathlike) -> list[ObjectRow]:
     """Read a label file (15 columns) or a result file (16, the score last); an empty file holds no objects.
 
-    Raises FormatError, one sentence with file, line and remedy, for any other line.
+    Raises InputError, one sentence with file, line and remedy, for any other line.
     """
     return [parse_row(line, place) for place, line in read_lines(path)]
 
@@ -128,17 +128,17 @@ def read_lines(path: Pathlike) -> list[tuple[str, str]]:
 
 
 def parse_row(line: str, place: str) -> ObjectRow:
-    """Read one line; `place` names it in the FormatError for a line that is no row."""
+    """Read one line; `place` names it in the InputError for a line that is no row."""
     columns = line.split()
     if len(columns) not in (15, 16):
-        raise FormatError(f"{place}: {len(columns)} columns; a label has 15 and a result 16, so write it again.")
+        raise InputError(f"{place}: {len(columns)} columns; a label has 15 and a result 16, so write it again.")
     try:
         occluded = int(columns[2])
         truncated, _, alpha, *values = (float(column) for column in columns[1:])
     except ValueError as error:
-        raise FormatError(f"{place}: {error}; write a number there, for the occlusion a whole one.") from None
+        raise InputError(f"{place}: {error}; write a number there, for the occlusion a whole one.") from None
     if not all(map(math.isfinite, (truncated, alpha, *values))):
-        raise FormatError(f"{place}: a value is not finite; write a number there.")
+        raise InputError(f"{place}: a value is not finite; write a number there.")
     x1, y1, x2, y2, height, width, length, x, y, z, rotation_y, *score = values
     return ObjectRow(
         columns[0],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ciassd_jax.formats.errors import FormatError, Pathlike, read_bytes
+from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes
 from ciassd_jax.formats.kitti import ObjectRow
 
 _COLUMNS = 16
@@ -27,7 +27,7 @@ class ResultFile(NamedTuple):
 def read_results(path: Pathlike) -> ResultFile:
     """Read a result file by the official rule; blank lines are nothing, an empty file holds no objects.
 
-    Raises FormatError, one sentence with file, line and remedy, for a value that is no finite number.
+    Raises InputError, one sentence with file, line and remedy, for a value that is no finite number.
     """
     # Bytes that are no text become values that are no numbers.
     text = read_bytes(path).decode("utf-8-sig", errors="replace")
@@ -54,10 +54,10 @@ def _parse(columns: list[str], place: str) -> ObjectRow:
     try:
         truncated, occluded, alpha, *values = map(float, columns[1:])
     except ValueError as error:
-        raise FormatError(f"{place}: {error}; write a number there.") from None
+        raise InputError(f"{place}: {error}; write a number there.") from None
     if not all(map(math.isfinite, (truncated, occluded, alpha, *values))):
         what = "a value" if math.isfinite(values[-1]) else "the score"
-        raise FormatError(f"{place}: {what} is not finite; write a number there.")
+        raise InputError(f"{place}: {what} is not finite; write a number there.")
     x1, y1, x2, y2, height, width, length, x, y, z, rotation_y, score = values
     return ObjectRow(
         columns[0],

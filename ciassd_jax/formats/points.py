@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32
 
-from ciassd_jax.formats.errors import FormatError, FormatWarning, Pathlike, read_bytes
+from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike, read_bytes
 
 POINT_SUFFIXES = (".bin", ".npy", ".npz", ".pcd")
 
@@ -32,18 +32,16 @@ def read_points(path: Pathlike, width: int = 4) -> Float32[np.ndarray, "N 4"]:
     - `.pcd`: ascii or binary, fields x, y, z and one of intensity, reflectance, i.
 
     Columns after the fourth are ignored. Where there is no intensity it is 0, and a warning says so.
-    Raises FormatError, one sentence with the remedy, for a file that is missing, empty or malformed.
+    Raises InputError, one sentence with the remedy, for a file that is missing, empty or malformed.
     """
     if width < 3:
         raise ValueError(f"width is {width}; a point has at least the 3 numbers x, y, z.")
     suffix = Path(path).suffix.lower()
     data = read_bytes(path)
     if suffix not in POINT_SUFFIXES:
-        raise FormatError(
-            f"{path} has the unknown suffix '{suffix}'; convert it to one of {', '.join(POINT_SUFFIXES)}."
-        )
+        raise InputError(f"{path} has the unknown suffix '{suffix}'; convert it to one of {', '.join(POINT_SUFFIXES)}.")
     if not data:
-        raise FormatError(f"{path} is empty; copy or record it again.")
+        raise InputError(f"{path} is empty; copy or record it again.")
     if suffix == ".bin":
         array = _read_bin(data, path, width)
     elif suffix == ".pcd":
@@ -70,7 +68,7 @@ def scale_intensity(points: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndar
 def _as_points(array: np.ndarray, path: Pathlike) -> Float32[np.ndarray, "N 4"]:
     """Take the first four columns, or three and intensity 0."""
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
-        raise FormatError(
+        raise InputError(
             f"{path} holds an array of shape {array.shape} and type {array.dtype}; "
             "save numbers of shape (N, 4): x, y, z, intensity."
         )
@@ -84,7 +82,7 @@ def _as_points(array: np.ndarray, path: Pathlike) -> Float32[np.ndarray, "N 4"]:
 
 def _read_bin(data: bytes, path: Pathlike, width: int) -> Float32[np.ndarray, "N width"]:
     if len(data) % (4 * width):
-        raise FormatError(
+        raise InputError(
             f"{path} has {len(data)} bytes, not a multiple of {4 * width} ({width} float32 per point); "
             "copy it again, or pass the true number as `width`."
         )
@@ -101,11 +99,11 @@ def _read_numpy(data: bytes, path: Pathlike, *, archive: bool) -> np.ndarray:
             if "points" in names or len(names) == 1:
                 return np.asarray(arrays["points" if "points" in names else names[0]])
     except Exception as error:  # NumPy and zipfile meet garbage with half a dozen types of error
-        raise FormatError(
+        raise InputError(
             f"{path} is cut short or no {'.npz' if archive else '.npy'} file of plain numbers; "
             f"write it again with np.{'savez' if archive else 'save'}."
         ) from error
-    raise FormatError(
+    raise InputError(
         f"{path} holds {len(names)} arrays ({', '.join(names)}) and none is named 'points'; "
         "write it again with np.savez(path, points=points)."
     )
@@ -133,7 +131,7 @@ def _read_pcd(data: bytes, path: Pathlike) -> Float[np.ndarray, "N columns"]:
     header, body = _read_pcd_header(data, path)
     missing = [name for name in "xyz" if name not in header.fields]
     if missing:
-        raise FormatError(
+        raise InputError(
             f"{path} has the fields {', '.join(header.fields)} but not {', '.join(missing)}; "
             "save it again with x, y, z and intensity."
         )
@@ -143,7 +141,7 @@ def _read_pcd(data: bytes, path: Pathlike) -> Float[np.ndarray, "N columns"]:
         return _read_pcd_ascii(body, path, header, fields)
     if header.storage == "binary":
         return _read_pcd_binary(body, path, header, fields)
-    raise FormatError(
+    raise InputError(
         f"{path} stores its points as '{header.storage}', which is not read; "
         f"convert it with `pcl_convert_pcd_ascii_binary {path} out.pcd 1`."
     )
@@ -155,9 +153,9 @@ def _read_pcd_ascii(
     try:
         values = np.array(body.split(), np.float64)
     except ValueError as error:
-        raise FormatError(f"{path} has a point that is no number; save it again.") from error
+        raise InputError(f"{path} has a point that is no number; save it again.") from error
     if values.size != header.num_points * header.columns:
-        raise FormatError(
+        raise InputError(
             f"{path} announces {header.num_points} points of {header.columns} numbers "
             f"but holds {values.size} numbers; copy or save it again."
         )
@@ -169,7 +167,7 @@ def _read_pcd_binary(
 ) -> Float[np.ndarray, "N columns"]:
     # A few bytes after the last point are harmless: some writers end the file with a newline.
     if len(body) // header.stride != header.num_points:
-        raise FormatError(
+        raise InputError(
             f"{path} announces {header.num_points} points of {header.stride} bytes "
             f"but holds {len(body)} bytes; copy or save it again."
         )
@@ -192,7 +190,7 @@ def _read_pcd_header(data: bytes, path: Pathlike) -> tuple[_PcdHeader, bytes]:
     try:
         return _parse_pcd_header(entries), stream.read()
     except (LookupError, TypeError, ValueError) as error:
-        raise FormatError(
+        raise InputError(
             f"{path} has a malformed PCD header ({str(error)[:80]}); "
             "save it again with FIELDS, SIZE, TYPE, WIDTH, HEIGHT, POINTS and DATA."
         ) from error

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ciassd_jax.formats.errors import FormatError, Pathlike, read_bytes
+from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes
 
 _OLD_MAGIC, _OLD_PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
 _AGAIN = "fetch the file again or save it again with `torch.save`."
@@ -48,19 +48,19 @@ def read_torch_file(path: Pathlike) -> dict[Any, Any]:
     NumPy scalar as a number, a torch dtype or device as its name) and a tensor as an array of its type,
     bfloat16 as float32. The arrays of tensors are read-only; those that share a storage share memory.
 
-    Raises FormatError for everything else: a missing, foreign or damaged file, or one that asks to run code.
+    Raises InputError for everything else: a missing, foreign or damaged file, or one that asks to run code.
     """
     raw = read_bytes(path)
     try:
         content = _read_zip(raw) if raw.startswith(b"PK\x03\x04") else _read_old(raw)
         if not isinstance(content, dict):
-            raise FormatError("holds no dictionary; save the model's state_dict with `torch.save`.")
+            raise InputError("holds no dictionary; save the model's state_dict with `torch.save`.")
         return content
-    except FormatError as error:
-        raise FormatError(f"{path} {error}") from None
+    except InputError as error:
+        raise InputError(f"{path} {error}") from None
     except Exception as error:
         # Malformed bytes make pickle, zipfile, zlib, struct and NumPy raise a dozen kinds of error.
-        raise FormatError(f"{path} is damaged or is no PyTorch weights file; {_AGAIN}") from error
+        raise InputError(f"{path} is damaged or is no PyTorch weights file; {_AGAIN}") from error
 
 
 def _read_zip(raw: bytes) -> Any:
@@ -68,10 +68,10 @@ def _read_zip(raw: bytes) -> Any:
         names = archive.namelist()
         folders = [name.removesuffix("data.pkl") for name in names if name.endswith("/data.pkl")]
         if len(folders) != 1:
-            raise FormatError(f"is a zip file without the one `data.pkl` of a weights file; {_AGAIN}")
+            raise InputError(f"is a zip file without the one `data.pkl` of a weights file; {_AGAIN}")
         folder = folders[0]
         if f"{folder}byteorder" in names and archive.read(f"{folder}byteorder") != b"little":
-            raise FormatError("was saved on a big-endian machine; save it again on a little-endian one.")
+            raise InputError("was saved on a big-endian machine; save it again on a little-endian one.")
         recorder = _Recorder(io.BytesIO(archive.read(f"{folder}data.pkl")))
         content = recorder.load()
         storages = {key: archive.read(f"{folder}data/{key}") for key in recorder.storage_dtypes}
@@ -80,10 +80,10 @@ def _read_zip(raw: bytes) -> Any:
 
 def _read_old(raw: bytes) -> Any:
     if not raw:
-        raise FormatError(f"is empty; {_AGAIN}")
+        raise InputError(f"is empty; {_AGAIN}")
     file = io.BytesIO(raw)
     if _Recorder(file).load() != _OLD_MAGIC or _Recorder(file).load() != _OLD_PROTOCOL:
-        raise FormatError(f"is no PyTorch weights file; {_AGAIN}")
+        raise InputError(f"is no PyTorch weights file; {_AGAIN}")
     _Recorder(file).load()  # the writer's byte order and type sizes; storages are little-endian all the same
     recorder = _Recorder(file)
     content = recorder.load()
@@ -92,7 +92,7 @@ def _read_old(raw: bytes) -> Any:
         (count,) = struct.unpack("<q", file.read(8))
         size = count * recorder.storage_dtypes[key].itemsize
         if not 0 <= size <= len(raw) - file.tell():
-            raise FormatError(f"ends before its last storage; {_AGAIN}")
+            raise InputError(f"ends before its last storage; {_AGAIN}")
         storages[key] = file.read(size)
     return _Resolver(storages).plain(content)
 
@@ -103,7 +103,7 @@ class _Inert:
     __slots__ = ()
 
     def __setstate__(self, state: object) -> None:
-        raise FormatError(f"sets the inner state of an object, as no weights file does; {_AGAIN}")
+        raise InputError(f"sets the inner state of an object, as no weights file does; {_AGAIN}")
 
 
 class _Global(_Inert):
@@ -156,7 +156,7 @@ class _Recorder(pickle._Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _GLOBALS:
             wanted = ascii(f"{module}.{name}")[1:-1][:80]
-            raise FormatError(
+            raise InputError(
                 f"asks to run `{wanted}`, which a weights file has no need for; "
                 "get the file from a source you trust or re-save its state_dict alone."
             )
@@ -167,7 +167,7 @@ class _Recorder(pickle._Unpickler):
             case ("storage", str(dtype), str(key), _, int(count), *view) if dtype in _DTYPES:
                 self.storage_dtypes.setdefault(key, _DTYPES[dtype])
                 return _Record(_storage, key, dtype, count, *view)
-        raise FormatError(f"describes a storage in an unknown way; {_AGAIN}")
+        raise InputError(f"describes a storage in an unknown way; {_AGAIN}")
 
 
 class _Resolver:
@@ -185,7 +185,7 @@ class _Resolver:
             self.done[id(value)] = _BUSY
             self.done[id(value)] = self._convert(value)
         if self.done[id(value)] is _BUSY:
-            raise FormatError(f"holds a container that contains itself; {_ALONE}")
+            raise InputError(f"holds a container that contains itself; {_ALONE}")
         return self.done[id(value)]
 
     def _convert(self, value: Any) -> Any:
@@ -195,7 +195,7 @@ class _Resolver:
             return type(value)(self.plain(entry) for entry in value)
         if isinstance(value, _Record):
             return value.build(self, *value.arguments)
-        raise FormatError(f"holds something other than tensors and plain data; {_ALONE}")
+        raise InputError(f"holds something other than tensors and plain data; {_ALONE}")
 
     def vector(self, key: str, dtype: str) -> np.ndarray:
         """All bytes of a storage as read-only numbers."""
@@ -218,13 +218,13 @@ def _check_inside(vector: np.ndarray, offset: Any, size: Any, stride: Any) -> No
         last = offset + sum((count - 1) * step for count, step in zip(size, stride, strict=True))
         if 0 in size or last < len(vector):
             return
-    raise FormatError(f"holds a tensor that reaches outside its storage; {_AGAIN}")
+    raise InputError(f"holds a tensor that reaches outside its storage; {_AGAIN}")
 
 
 def _storage(resolver: _Resolver, key: str, dtype: str, count: int, view: Any = None) -> np.ndarray:
     """A storage, or its part `view` = (name, offset, count), as a vector."""
     if len(resolver.storages[key]) != count * _DTYPES[dtype].itemsize:
-        raise FormatError(f"holds a storage of another size than it says; {_AGAIN}")
+        raise InputError(f"holds a storage of another size than it says; {_AGAIN}")
     vector = resolver.vector(key, dtype)
     if view is None:
         return vector
@@ -236,9 +236,9 @@ def _storage(resolver: _Resolver, key: str, dtype: str, count: int, view: Any = 
 def _tensor(resolver: _Resolver, storage: Any, offset: Any, size: Any, stride: Any, *rest: Any) -> np.ndarray:
     """A strided view of a storage; `rest` = (requires_grad, hooks, metadata), any of them absent."""
     if not isinstance(storage, _Record) or storage.build is not _storage:
-        raise FormatError(f"holds a tensor without a storage; {_AGAIN}")
+        raise InputError(f"holds a tensor without a storage; {_AGAIN}")
     if len(rest) > 2 and rest[2]:
-        raise FormatError(f"holds a conjugated or negated tensor; {_ALONE}")
+        raise InputError(f"holds a conjugated or negated tensor; {_ALONE}")
     vector = resolver.plain(storage)
     _check_inside(vector, offset, size, stride)
     if 0 in size:
@@ -254,7 +254,7 @@ def _parameter(resolver: _Resolver, data: Any, *flags_and_hooks: Any) -> Any:
 def _numpy_dtype(resolver: _Resolver, code: Any, align: Any, copy: Any, state: Any) -> np.dtype:
     """A type of numbers or characters, never of objects: NumPy would take any bytes for their addresses."""
     if not re.fullmatch("[biufc][1248]|c16|[SU][1-9][0-9]{0,3}", code) or state[1] not in tuple("<>|="):
-        raise FormatError(f"holds a NumPy array of something other than numbers; {_ALONE}")
+        raise InputError(f"holds a NumPy array of something other than numbers; {_ALONE}")
     return np.dtype(state[1] + code)
 
 
@@ -262,7 +262,7 @@ def _numpy_array(resolver: _Resolver, kind: Any, dummy_shape: Any, dummy_type: A
     _, shape, dtype, column_major, raw = state
     dtype = resolver.plain(dtype)
     if not isinstance(dtype, np.dtype) or len(raw) != math.prod(shape) * dtype.itemsize:
-        raise FormatError(f"holds a malformed NumPy array; {_AGAIN}")
+        raise InputError(f"holds a malformed NumPy array; {_AGAIN}")
     array = np.ndarray(shape, dtype, raw, order="F" if column_major else "C")
     return array.astype(dtype.newbyteorder("="))
 
@@ -278,7 +278,7 @@ def _device(kind: Any, *index: Any) -> str:
 def _encode(text: Any, encoding: Any) -> bytes:
     """How pickles of protocol 2 write bytes."""
     if encoding != "latin1":
-        raise FormatError(f"holds bytes written in an unknown way; {_AGAIN}")
+        raise InputError(f"holds bytes written in an unknown way; {_AGAIN}")
     return text.encode("latin1")
 
 

@@ -7,24 +7,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ciassd_jax.formats.errors import FormatError, Pathlike
+from ciassd_jax.formats.errors import InputError, Pathlike
 
 
 def check_folder(folder: Pathlike) -> None:
-    """Raise FormatError unless files can be written in `folder`, which need not exist yet; creates nothing."""
+    """Raise InputError unless files can be written in `folder`, which need not exist yet; creates nothing."""
     path = Path(folder).absolute()
     existing = next(p for p in (path, *path.parents) if os.path.lexists(p))
     if not existing.is_dir():
-        raise FormatError(f"{folder} cannot be a folder, as {existing} is a file; choose another place.")
+        raise InputError(f"{folder} cannot be a folder, as {existing} is a file; choose another place.")
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise FormatError(f"{folder} cannot be written, as {existing} is read-only; choose another place.")
+        raise InputError(f"{folder} cannot be written, as {existing} is read-only; choose another place.")
 
 
 @contextmanager
 def replacing(path: Pathlike) -> Iterator[Path]:
     """A path beside `path` to write to; it takes that place when the block ends well and is removed otherwise.
 
-    The folder is made where it is missing. Raises FormatError for what the operating system refuses.
+    The folder is made where it is missing. Raises InputError for what the operating system refuses.
     """
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
@@ -33,7 +33,7 @@ def replacing(path: Pathlike) -> Iterator[Path]:
         yield temporary
         temporary.replace(target)
     except OSError as error:
-        raise FormatError(f"{path} cannot be written ({error.strerror}); choose another place.") from error
+        raise InputError(f"{path} cannot be written ({error.strerror}); choose another place.") from error
     finally:
         # Below a file even the removal of nothing is an error.
         if temporary.exists():

@@ -11,6 +11,9 @@ from jaxtyping import Bool, Float, Float64
 
 from ciassd_jax.types import Array
 
+# Half-spaces that hold every point: no camera, no frustum.
+ANYWHERE = np.tile(np.array([0, 0, 0, 1], np.float32), (6, 1))
+
 
 def frustum_planes(
     projection: Float[np.ndarray, "3 4"], *, width: int, height: int, near: float = 0.001, far: float = 100.0

@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ciassd_jax.detector import DroppedWarning
-from ciassd_jax.formats.errors import Pathlike
+from ciassd_jax.formats.errors import DroppedWarning, Pathlike
 from ciassd_jax.formats.kitti import lidar_to_image
 from ciassd_jax.formats.writing import write_text
-from ciassd_jax.view.frames import ViewFrame
 from ciassd_jax.view.outlines import outline_boxes, project_segments
 from ciassd_jax.view.sampling import choose_points, usable_boxes
+from ciassd_jax.view.view_frame import ViewFrame
 
 try:
     from PIL import Image
@@ -58,7 +57,7 @@ class Page:
         return f'<iframe srcdoc="{html.escape(self.html)}" style="width:100%;height:640px;border:0"></iframe>'
 
     def save(self, path: Pathlike) -> Path:
-        """Write the page, whole or not at all; raises FormatError where that fails."""
+        """Write the page, whole or not at all; raises InputError where that fails."""
         write_text(path, self.html)
         return Path(path)
 

@@ -12,17 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
+from ciassd_jax.data.clouds import CloudFile, find_beside, find_clouds
 from ciassd_jax.data.custom import CustomRow, parse_custom_row, read_custom_rows
 from ciassd_jax.data.folders import is_custom, open_dataset
 from ciassd_jax.data.frames import clean_points
 from ciassd_jax.data.kitti import IGNORED, IMAGE, kitti_folder, read_objects
-from ciassd_jax.formats.errors import FormatError, FormatWarning, read_bytes
+from ciassd_jax.formats.errors import FormatWarning, InputError, read_bytes
 from ciassd_jax.formats.kitti import read_lines, read_rows, rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera
 from ciassd_jax.formats.points import read_points
-from ciassd_jax.predict_files import Frame as CloudFile
-from ciassd_jax.predict_files import find_beside, find_frames
-from ciassd_jax.view.frames import ViewFrame, frame_to_view
+from ciassd_jax.view.view_frame import ViewFrame, frame_to_view
 
 # Folders of clouds, and where their labels lie beside them: KITTI's and OpenPCDet's custom layout.
 _LABELS = {"velodyne": "label_2", "velodyne_reduced": "label_2", "points": "labels"}
@@ -40,7 +39,7 @@ def find_sources(path: Path, split: str = "all", image_size: tuple[int, int] | N
 
     A data set is a folder in KITTI's layout, whose clouds are cropped to the camera's view, or in OpenPCDet's custom
     layout. Clouds of a folder are shown whole; labels and images in such a layout beside it belong to them.
-    Raises FormatError, one sentence with the remedy, for a path that is none of these.
+    Raises InputError, one sentence with the remedy, for a path that is none of these.
     """
     if any((path / part).is_dir() for part in ("training", "testing", "points")):
         dataset = open_dataset(path, split, image_size)
@@ -51,10 +50,8 @@ def find_sources(path: Path, split: str = "all", image_size: tuple[int, int] | N
         }
     inside = next((path / name for name in _LABELS if (path / name).is_dir()), None)
     if inside:
-        raise FormatError(
-            f"{path} is part of a data set; name {path.parent} for the whole, or {inside} for its clouds."
-        )
-    clouds = find_frames(path, image_size=image_size)
+        raise InputError(f"{path} is part of a data set; name {path.parent} for the whole, or {inside} for its clouds.")
+    clouds = find_clouds(path, image_size=image_size)
     return {
         file.cloud.stem: Source(partial(_read_cloud, file), find_beside(file.cloud, "image_2", ".png"))
         for file in clouds
@@ -62,13 +59,13 @@ def find_sources(path: Path, split: str = "all", image_size: tuple[int, int] | N
 
 
 def read_source(source: Source, *, image: bool = False) -> ViewFrame:
-    """Read a frame, with its image where one is wanted and there; FormatError for a file that cannot be used."""
+    """Read a frame, with its image where one is wanted and there; InputError for a file that cannot be used."""
     frame = source.read()
     return frame._replace(image=read_image(source.image)) if image and source.image else frame
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Read an image's colours; FormatError if it is none."""
+    """Read an image's colours; InputError if it is none."""
     try:
         from PIL import Image, UnidentifiedImageError
     except ModuleNotFoundError as error:
@@ -77,14 +74,14 @@ def read_image(path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise FormatError(f"{path} cannot be read as an image; copy it again, or leave out the images.") from error
+        raise InputError(f"{path} cannot be read as an image; copy it again, or leave out the images.") from error
 
 
 def add_saved(frame: ViewFrame, folder: Path) -> ViewFrame | None:
     """The frame with the detections that `folder` holds for it: NAME.json, else NAME.txt; None if it has neither.
 
     JSON is what `ciassd predict` writes. Rows are KITTI's, or without a camera those of `ciassd eval`: x, y, z, length,
-    width, height, yaw, class, score. Raises FormatError for a file that is neither.
+    width, height, yaw, class, score. Raises InputError for a file that is neither.
     """
     path = _existing(folder, f"{frame.name}.json") or _existing(folder, f"{frame.name}.txt")
     if path is None:
@@ -134,14 +131,14 @@ def _read_json(path: Path) -> _Saved:
     except (ValueError, TypeError, LookupError):
         fits = False
     if not fits:
-        raise FormatError(f"{path} holds no detections as `ciassd predict` writes them; write it again.")
+        raise InputError(f"{path} holds no detections as `ciassd predict` writes them; write it again.")
     return boxes, scores, labels
 
 
 def _read_kitti(path: Path, camera: Camera) -> _Saved:
     rows = [row for row in read_rows(path) if row.type != IGNORED]
     if any(row.score is None for row in rows):
-        raise FormatError(f"{path} has rows without a score, so they are no detections; name the folder of results.")
+        raise InputError(f"{path} has rows without a score, so they are no detections; name the folder of results.")
     scores = np.array([row.score for row in rows], np.float64)
     return np.asarray(rows_to_boxes(rows, camera.calibration).to_array()), scores, tuple(row.type for row in rows)
 
@@ -151,12 +148,12 @@ def _read_custom(path: Path) -> _Saved:
     for place, line in read_lines(path):
         *columns, score = line.split()
         if len(columns) == 14:
-            raise FormatError(f"{path} holds KITTI's rows, which need a camera; give the frame a calibration.")
+            raise InputError(f"{path} holds KITTI's rows, which need a camera; give the frame a calibration.")
         rows.append(parse_custom_row(" ".join(columns), place))
         try:
             scores.append(float(score))
         except ValueError as error:
-            raise FormatError(f"{place}: {error}; write the score last.") from None
+            raise InputError(f"{place}: {error}; write the score last.") from None
     boxes = np.array([row.box for row in rows], np.float64).reshape(-1, 7)
     return boxes, np.array(scores, np.float64), tuple(row.type for row in rows)
 

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles_data import accept_by_loop, box_coordinates, footprint, inside, move_by_loop
 
-from ciassd_jax.config import ClassConfig
+from ciassd_jax.config import AugmentationConfig, ClassConfig
+from ciassd_jax.config.presets import tiny
 from ciassd_jax.data.augment import (
     accept_objects,
     add_object_noise,
@@ -27,9 +28,7 @@ from ciassd_jax.data.augment import (
     shuffle_points,
 )
 from ciassd_jax.ops.boxes import to_paper
-from ciassd_jax.presets import tiny
-from ciassd_jax.training_config import AugmentationConfig
-from ciassd_jax.types import Boxes, GroundTruth, PasteObjects, PointCloud, Scene
+from ciassd_jax.types import Boxes, GroundTruth, PointCloud, SampledObjects, Scene
 
 POINTS, BOXES, PASTE_POINTS = 512, 16, 256
 # Slots of one round, for two classes.
@@ -39,14 +38,14 @@ LABELS = np.repeat([0, 1], 2 * np.array(ROUND)).astype(np.int32)
 CONFIG = replace(
     tiny(),
     classes=(
-        ClassConfig(paste_up_to=ROUND[0]),
-        ClassConfig(name="Cyclist", length=1.8, width=0.6, paste_up_to=ROUND[1]),
+        ClassConfig(gt_sampling_up_to=ROUND[0]),
+        ClassConfig(name="Cyclist", length=1.8, width=0.6, gt_sampling_up_to=ROUND[1]),
     ),
-    data=replace(tiny().data, max_points=POINTS, max_boxes=BOXES, max_paste_points=PASTE_POINTS),
+    data=replace(tiny().data, max_points=POINTS, max_boxes=BOXES, max_gt_sampling_points=PASTE_POINTS),
 )
 compiled_augment = jax.jit(augment, static_argnames="config")
-accept = jax.jit(partial(accept_objects, paste_up_to=ROUND))
-paste = jax.jit(partial(paste_objects, paste_up_to=ROUND))
+accept = jax.jit(partial(accept_objects, gt_sampling_up_to=ROUND))
+paste = jax.jit(partial(paste_objects, gt_sampling_up_to=ROUND))
 noise = jax.jit(partial(add_object_noise, config=AugmentationConfig(noise_tries=10)))
 compiled = {name: jax.jit(function) for name, function in (("flip", flip), ("rotate", rotate), ("scale", scale))}
 
@@ -93,8 +92,8 @@ def random_scene(seed: int, number: int = 6, reach: float = 6.0) -> Scene:
     return make_scene(rng.permutation(points), boxes, rng.choice([-1, 0, 0, 1], number))
 
 
-def make_objects(boxes: np.ndarray, points: np.ndarray, owner: np.ndarray, valid: np.ndarray, wanted) -> PasteObjects:
-    return PasteObjects(
+def make_objects(boxes: np.ndarray, points: np.ndarray, owner: np.ndarray, valid: np.ndarray, wanted) -> SampledObjects:
+    return SampledObjects(
         Boxes.from_array(boxes),
         LABELS,
         valid,
@@ -105,7 +104,7 @@ def make_objects(boxes: np.ndarray, points: np.ndarray, owner: np.ndarray, valid
     )
 
 
-def random_objects(seed: int, reach: float = 7.0, each: int = 10) -> PasteObjects:
+def random_objects(seed: int, reach: float = 7.0, each: int = 10) -> SampledObjects:
     """Draws of which some are missing, and `wanted` from none to all."""
     rng = np.random.default_rng((seed, 1))
     valid = rng.random(OBJECTS) < 0.9
@@ -114,7 +113,7 @@ def random_objects(seed: int, reach: float = 7.0, each: int = 10) -> PasteObject
     return make_objects(boxes, points_within(rng, boxes[valid], each), owner, valid, rng.integers(0, np.add(ROUND, 1)))
 
 
-def no_objects() -> PasteObjects:
+def no_objects() -> SampledObjects:
     return make_objects(
         np.zeros((OBJECTS, 7), np.float32), np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(OBJECTS, bool), (0, 0)
     )
@@ -168,7 +167,7 @@ def test_draws_are_accepted_as_defined():
     assert accepted[:, ROUND[0] : 2 * ROUND[0]].any()
 
 
-def draws_at(places: list[float | None], wanted) -> PasteObjects:
+def draws_at(places: list[float | None], wanted) -> SampledObjects:
     """A unit box and a point for every slot at x, or none."""
     boxes, owner = np.zeros((OBJECTS, 7), np.float32), []
     for slot, x in enumerate(places):
@@ -488,7 +487,7 @@ def test_one_switch_does_one_thing(switch):
 
 
 def test_without_slots_nothing_is_pasted():
-    config = replace(CONFIG, classes=tuple(replace(one, paste_up_to=0) for one in CONFIG.classes))
+    config = replace(CONFIG, classes=tuple(replace(one, gt_sampling_up_to=0) for one in CONFIG.classes))
     none = np.zeros(0, np.int32)
     objects = no_objects()._replace(
         boxes=Boxes.from_array(np.zeros((0, 7), np.float32)),

@@ -10,7 +10,7 @@ from mini_folders import OBJECTS, full_cloud, object_boxes, write_custom
 from ciassd_jax.data.custom import read_custom_rows
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import difficulty_by_points
-from ciassd_jax.formats.errors import FormatError, FormatWarning
+from ciassd_jax.formats.errors import FormatWarning, InputError
 
 
 def test_a_frame_is_what_its_files_say(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_difficulty_is_by_points() -> None:
 def test_an_unusable_row_gets_one_sentence(tmp_path: Path, line: str, message: str) -> None:
     path = tmp_path / "a.txt"
     path.write_text(f"1 2 3 4 5 6 7 Car\n{line}\n")
-    with pytest.raises(FormatError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_custom_rows(path)
     assert str(caught.value).startswith(f"{path}, ")
     assert not re.search(r"\. [A-Z]|\n", str(caught.value))

@@ -12,7 +12,7 @@ from small import CALIBRATION, IMAGE_SIZE
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.data.kitti import crop_to_view, read_objects, read_seen_points, write_reduced
-from ciassd_jax.formats.errors import FormatError, FormatWarning
+from ciassd_jax.formats.errors import FormatWarning, InputError
 from ciassd_jax.formats.kitti import ObjectRow, boxes_to_rows, lidar_to_image, rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera, read_camera
 from ciassd_jax.formats.points import read_points, write_bin
@@ -125,7 +125,7 @@ def test_no_warning_of_images_where_nothing_is_cropped(tmp_path: Path) -> None:
 def test_an_unknown_camera_without_its_image_is_refused(tmp_path: Path) -> None:
     root = write_kitti(tmp_path, clouds="velodyne_reduced")
     (root / "training/image_2/000000.png").unlink()
-    with pytest.raises(FormatError, match=r"calib/000000\.txt has a focal length of 300 pixels, .* --image-size"):
+    with pytest.raises(InputError, match=r"calib/000000\.txt has a focal length of 300 pixels, .* --image-size"):
         read_first(root)
 
 
@@ -165,7 +165,7 @@ def test_intensities_of_0_to_255_are_divided(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_used_gets_one_sentence(tmp_path: Path, file: str, damage, message: str) -> None:
     path = write_kitti(tmp_path) / "training" / file
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(FormatError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_first(tmp_path)
     assert not re.search(r"\. [A-Z]|\n", str(caught.value))
 
@@ -239,5 +239,5 @@ def test_every_frame_of_the_reference_data_reads(shared: Path) -> None:
 def test_a_cloud_that_vanishes_after_opening_is_named(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
     camera = read_camera(root / "training/calib/000000.txt", image_size=IMAGE_SIZE)
-    with pytest.raises(FormatError, match=r"velodyne/000009\.bin does not exist; copy it, or take the frame off"):
+    with pytest.raises(InputError, match=r"velodyne/000009\.bin does not exist; copy it, or take the frame off"):
         read_seen_points(root / "training", "000009", camera)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ciassd_jax import Config, three_class, tiny
+from ciassd_jax.config import AugmentationConfig
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.data.scenes import pad_frame, target_labels
-from ciassd_jax.formats.errors import FormatError
-from ciassd_jax.training_config import AugmentationConfig
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.types import Boxes
 
 TYPES = ("Van", "Car", "Truck", "Pedestrian", "Car")
@@ -92,5 +92,5 @@ def test_a_box_without_a_size_is_refused(size: float) -> None:
     frame = make_frame()
     frame.boxes.size[2, 1] = size
     message = rf"Frame 000007: object 2 \(Truck\) has the size .* x {size:g} x .*; mend or remove its line"
-    with pytest.raises(FormatError, match=message):
+    with pytest.raises(InputError, match=message):
         pad_frame(frame, 0, tiny())

@@ -8,7 +8,7 @@ from mini_folders import write_custom, write_kitti, write_split
 
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.splits import official_split
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 
 # SPEC 1.5.
 CHECKSUMS = {
@@ -77,7 +77,7 @@ def test_a_split_that_cannot_be_read_gets_one_sentence(
     root = write_kitti(tmp_path)
     if names is not None:
         write_split(root, split, *names)
-    with pytest.raises(FormatError, match=message):
+    with pytest.raises(InputError, match=message):
         open_dataset(root, split)
 
 
@@ -85,7 +85,7 @@ def test_a_split_that_cannot_be_read_gets_one_sentence(
 def test_a_frame_without_one_of_its_files_is_named(tmp_path: Path, folder: str, kind: str) -> None:
     root = write_kitti(tmp_path)
     next((root / "training" / folder).glob("000001.*")).unlink()
-    with pytest.raises(FormatError, match=rf"1 of 3 frames have no {kind} .*{folder}.* \(000001\); copy them"):
+    with pytest.raises(InputError, match=rf"1 of 3 frames have no {kind} .*{folder}.* \(000001\); copy them"):
         open_dataset(root, "all")
 
 
@@ -93,17 +93,15 @@ def test_custom_data_have_no_official_list(tmp_path: Path) -> None:
     root = write_custom(tmp_path)
     assert open_dataset(root, "train").names == ("a", "b")
     assert open_dataset(root, "all").names == ("a", "b")
-    with pytest.raises(FormatError, match=r"val\.txt does not exist; write it"):
+    with pytest.raises(InputError, match=r"val\.txt does not exist; write it"):
         open_dataset(root, "val")
 
 
 def test_a_folder_of_neither_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(
-        FormatError, match=r"has no folder training or testing \(KITTI\) or points .*; check the path\."
-    ):
+    with pytest.raises(InputError, match=r"has no folder training or testing \(KITTI\) or points .*; check the path\."):
         open_dataset(tmp_path, "train")
     monkeypatch.delenv("KITTI_ROOT", raising=False)
-    with pytest.raises(FormatError, match=r"No data set is named; give its folder, or set KITTI_ROOT to it\."):
+    with pytest.raises(InputError, match=r"No data set is named; give its folder, or set KITTI_ROOT to it\."):
         open_dataset(None, "train")
     monkeypatch.setenv("KITTI_ROOT", str(write_kitti(tmp_path)))
     assert len(open_dataset(None, "all")) == 3

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.kitti import (
     Calibration,
     ObjectRow,
@@ -101,7 +101,7 @@ def test_no_file_and_a_directory(tmp_path, read):
 
 
 def assert_refused(read, path, message):
-    with pytest.raises(FormatError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read(path)
     assert str(caught.value).startswith(str(path))
     assert str(caught.value).endswith(".")

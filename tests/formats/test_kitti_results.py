@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.kitti import ObjectRow, read_rows, write_rows
 from ciassd_jax.formats.kitti_results import read_results
 
@@ -55,17 +55,17 @@ def test_an_empty_file(tmp_path: Path) -> None:
     ],
 )
 def test_no_numbers(tmp_path: Path, old: str, new: str, message: str) -> None:
-    with pytest.raises(FormatError, match=message):
+    with pytest.raises(InputError, match=message):
         read_results(write(tmp_path, ROW, ROW.replace(old, new)))
 
 
 def test_bytes_that_are_no_text(tmp_path: Path) -> None:
     path = tmp_path / "000000.txt"
     path.write_bytes(b"Car " + b"\xff " * 15)
-    with pytest.raises(FormatError, match=r"000000.txt, line 1: could not convert"):
+    with pytest.raises(InputError, match=r"000000.txt, line 1: could not convert"):
         read_results(path)
 
 
 def test_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         read_results(tmp_path / "none.txt")

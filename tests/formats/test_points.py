@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.points import POINT_SUFFIXES, read_points, write_bin
 
 POINTS = np.array([[1.5, -2.0, 0.25, 0.5], [70.0, 39.5, -3.0, 1.0], [0.0, 1e-3, -0.1, 0.0]], np.float32)
@@ -187,7 +187,7 @@ BAD = {
 def test_an_unusable_file_gets_one_sentence(tmp_path, name):
     data, message = BAD[name]
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(FormatError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_points(tmp_path / name)
     assert_one_sentence(str(caught.value), tmp_path / name)
 
@@ -197,7 +197,7 @@ def test_no_file_and_a_directory(tmp_path):
         (tmp_path / "no.bin", "does not exist; check the path"),
         (tmp_path, "is a directory; name a file inside it"),
     ]:
-        with pytest.raises(FormatError, match=message) as caught:
+        with pytest.raises(InputError, match=message) as caught:
             read_points(path)
         assert_one_sentence(str(caught.value), path)
 
@@ -219,7 +219,7 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory, name, data):
     path.write_bytes(content[: data.draw(st.integers(0, len(content)))])
     try:
         points = read_points(path)
-    except FormatError:
+    except InputError:
         return
     assert points.dtype == np.float32
     assert points.shape[1:] == (4,)

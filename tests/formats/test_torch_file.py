@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load_file
 
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.torch_file import read_torch_file
 
 STORAGE_NAMES = {
@@ -295,7 +295,7 @@ def test_old_storage_views(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read["w"], [5, 6])
     for view in [("view", 8, 3), ("view", -1, 3), ("view", 0, -1), ("view", 0, 1), (1, 2)]:
         outside = Storage("0", np.arange(10, dtype=np.int32), tail=(view,))
-        with pytest.raises(FormatError):
+        with pytest.raises(InputError):
             read_torch_file(write_old(tmp_path / "w.pth", {"w": tensor(outside, 1, (2,), (1,))}))
 
 
@@ -349,7 +349,7 @@ def test_shared_containers_take_linear_time(write: Writer, tmp_path: Path) -> No
 
 
 def refused(path: Path, *words: str) -> str:
-    with pytest.raises(FormatError) as caught:
+    with pytest.raises(InputError) as caught:
         read_torch_file(path)
     message = str(caught.value)
     assert message.startswith(str(path)), message
@@ -641,7 +641,7 @@ def test_changed_bytes_are_refused_or_give_plain_data(
     ):
         raw[place] = byte
     (tmp_path / "bad.pth").write_bytes(raw)
-    with contextlib.suppress(FormatError):
+    with contextlib.suppress(InputError):
         assert is_plain(read_torch_file(tmp_path / "bad.pth"))
 
 

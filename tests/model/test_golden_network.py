@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 
 from ciassd_jax.config import HeadConfig
-from ciassd_jax.model.detector import CIASSD
+from ciassd_jax.config.presets import car_released
+from ciassd_jax.inference.postprocess import postprocess
+from ciassd_jax.inference.predict import predict
+from ciassd_jax.inference.weights import load_weights
 from ciassd_jax.model.head import MultiTaskHead
+from ciassd_jax.model.network import CIASSD, RawPredictions, voxelize_batch
 from ciassd_jax.ops import boxes as box_ops
 from ciassd_jax.ops import sites as site_ops
 from ciassd_jax.ops.camera import frustum_planes
 from ciassd_jax.ops.sites import NO_SITE, coordinates_of, linear_keys
-from ciassd_jax.prediction import RawPredictions, postprocess, predict, voxelize_batch
-from ciassd_jax.presets import car_released
 from ciassd_jax.types import PointCloud
-from ciassd_jax.weights import load_weights
 
 # Our names of the 14 sparse layers, in the order of the released code, and the resolution of each.
 LAYERS = {

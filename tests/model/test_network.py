@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ciassd_jax import presets
-from ciassd_jax.config import Config
+from ciassd_jax.config import Config, presets
+from ciassd_jax.inference.postprocess import postprocess
+from ciassd_jax.inference.predict import predict
 from ciassd_jax.model.backbone import SPConvNet
-from ciassd_jax.model.detector import init_variables
-from ciassd_jax.prediction import postprocess, predict, predict_raw, voxelize_batch
+from ciassd_jax.model.network import init_variables, predict_raw, voxelize_batch
 from ciassd_jax.types import PointCloud, SparseVoxels
 
 ROWS = 1024

@@ -12,9 +12,9 @@ from small import QUICK, random_scene, random_variables, small_config
 from study import with_neck, without_iou
 
 from ciassd_jax import Config, car, create_train_state, train_step
-from ciassd_jax.info import count_flops, count_parameters
-from ciassd_jax.model.detector import init_variables
-from ciassd_jax.prediction import postprocess, predict_raw
+from ciassd_jax.inference.cost import count_flops, count_parameters
+from ciassd_jax.inference.postprocess import postprocess
+from ciassd_jax.model.network import init_variables, predict_raw
 
 
 def shapes_of(config: Config) -> dict:

@@ -7,14 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles import (
-    Cluster,
-    greedy_nms_loop,
-    paper_di_nms_loop,
-    polygon_iou_matrix,
-    refined_score,
-    released_di_nms_loop,
-)
+from oracles import Cluster, greedy_nms_loop, paper_di_nms_loop, polygon_iou_matrix, refined_score, released_di_nms_loop
 
 from ciassd_jax.ops.iou import iou_bev
 from ciassd_jax.ops.nms import (

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import VoxelsByLoop, voxelize_loop
 
-from ciassd_jax import presets
+from ciassd_jax.config import presets
 from ciassd_jax.ops.voxelize import _floor_of_quotient, voxel_coordinates, voxelize
 from ciassd_jax.types import PointCloud, SparseVoxels
 

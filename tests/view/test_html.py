@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from small import CALIBRATION, IMAGE_SIZE
 
-from ciassd_jax.detector import DroppedWarning, FrameResult
-from ciassd_jax.formats.errors import FormatError
+from ciassd_jax.formats.errors import DroppedWarning, InputError
 from ciassd_jax.formats.kitti import lidar_to_image
 from ciassd_jax.formats.kitti_camera import Camera, read_camera
-from ciassd_jax.view.frames import ViewFrame
+from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.view.html import FRAME_POINTS, STEP, Page, view_html
 from ciassd_jax.view.outlines import outline_boxes, project_segments
+from ciassd_jax.view.view_frame import ViewFrame
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform([0, -30, -2, 0], [60, 30, 1, 1], (3000, 4)).astype(np.float32)
@@ -153,7 +153,7 @@ def test_a_page_is_saved_whole_and_shown_in_a_frame_of_its_own(tmp_path: Path) -
     assert html.unescape(source) == page.html
     assert repr(page).startswith("Page of 1 frame, ")
     (tmp_path / "file").touch()
-    with pytest.raises(FormatError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot be written"):
         page.save(tmp_path / "file" / "page.html")
 
 

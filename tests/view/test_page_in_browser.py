@@ -17,10 +17,10 @@ import pytest
 from small import CALIBRATION, IMAGE_SIZE
 
 from ciassd_jax.formats.kitti_camera import read_camera
-from ciassd_jax.view.frames import ViewFrame
 from ciassd_jax.view.html import Page, view_html
 from ciassd_jax.view.outlines import outline_boxes
 from ciassd_jax.view.sources import read_image
+from ciassd_jax.view.view_frame import ViewFrame
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (apt-get install -y chromium)")

@@ -1,0 +1,211 @@
+"""What a detector is, as frozen dataclasses of numbers and tuples; `presets.py` has the named ones.
+
+A config is hashable (a static argument of jit), says why a value is refused, and round-trips through JSON.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """The voxel grid; x, y, z in metres (SPEC section 3; paper section 4.1)."""
+
+    minimum: tuple[float, float, float] = (0.0, -40.0, -3.0)
+    maximum: tuple[float, float, float] = (70.4, 40.0, 1.0)
+    voxel_size: tuple[float, float, float] = (0.05, 0.05, 0.1)
+    max_points_per_voxel: int = 5
+    max_voxels: int = 20000
+    # What happens to the points that come after the last voxel was given out: "skip" leaves out new voxels
+    # only, "stop" ignores every later point, as the released code does.
+    overflow: Literal["skip", "stop"] = "skip"
+
+    def __post_init__(self) -> None:
+        for axis, low, high, size in zip("xyz", self.minimum, self.maximum, self.voxel_size, strict=True):
+            if not (size > 0 and 0 < high - low < math.inf):
+                raise ValueError(
+                    f"grid.{axis}: range {low}..{high} with voxel size {size} is empty or "
+                    "endless; the maximum must exceed the minimum, both finite, and the voxel size be positive."
+                )
+            cells = (high - low) / size
+            if round(cells) < 1 or abs(cells - round(cells)) > 1e-3:
+                raise ValueError(
+                    f"grid.{axis}: {high - low:g} m is {cells:.3f} voxels of {size} m, which is no whole number; "
+                    f"the nearest valid maximum is {low + max(round(cells), 1) * size:g}."
+                )
+        if self.max_points_per_voxel < 1 or self.max_voxels < 1:
+            raise ValueError("grid: max_points_per_voxel and max_voxels must be at least 1.")
+        if self.overflow not in ("skip", "stop"):
+            raise ValueError(f"grid: overflow {self.overflow!r} is unknown; choose 'skip' or 'stop'.")
+        depth, height, width = self.shape
+        if depth * height * width >= 2**31:
+            raise ValueError(
+                f"grid: {depth} x {height} x {width} voxels do not fit the 32-bit keys of the sparse "
+                "convolutions; use larger voxels or a smaller range."
+            )
+
+    @property
+    def cells(self) -> tuple[int, int, int]:
+        """Number of voxels along x, y, z."""
+        x, y, z = (
+            round((high - low) / size)
+            for low, high, size in zip(self.minimum, self.maximum, self.voxel_size, strict=True)
+        )
+        return x, y, z
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (z, y, x) of the sparse grid: one empty layer on top, as in SECOND."""
+        x, y, z = self.cells
+        return z + 1, y, x
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One resolution of the backbone: a strided convolution into it (none for the first), then submanifold ones."""
+
+    channels: int
+    layers: int
+    capacity: int
+    z_padding: int = 1
+
+    def __post_init__(self) -> None:
+        if self.channels < 1 or self.layers < 0 or self.capacity < 1 or self.z_padding not in (0, 1):
+            raise ValueError(
+                f"backbone stage {self}: channels and capacity must be at least 1, layers at least 0, z_padding 0 or 1."
+            )
+
+
+@dataclass(frozen=True)
+class BackboneConfig:
+    """SPConvNet (paper section 3.1, SPEC section 4). The first stage's capacity is the grid's `max_voxels`."""
+
+    stages: tuple[StageConfig, ...] = (
+        StageConfig(channels=16, layers=2, capacity=20000),
+        StageConfig(channels=32, layers=2, capacity=48000),
+        StageConfig(channels=64, layers=3, capacity=36000),
+        StageConfig(channels=64, layers=3, capacity=18000, z_padding=0),
+    )
+    out_channels: int = 64
+    out_capacity: int = 16000
+    # "gather" computes active sites only; "dense" the whole grid: the definition, for small grids and tests.
+    backend: Literal["gather", "dense"] = "gather"
+
+    def __post_init__(self) -> None:
+        if not self.stages:
+            raise ValueError("backbone: at least one stage is needed.")
+        if self.backend not in ("gather", "dense"):
+            raise ValueError(f"backbone: backend {self.backend!r} is unknown; choose 'gather' or 'dense'.")
+
+    def stage_shapes(self, shape: tuple[int, int, int]) -> tuple[tuple[int, int, int], ...]:
+        """Grid shape (z, y, x) of every stage and of the output, from the shape of the input."""
+        shapes = [shape]
+        for stage in self.stages[1:]:
+            depth, height, width = shapes[-1]
+            shapes.append(((depth + 2 * stage.z_padding - 3) // 2 + 1, (height - 1) // 2 + 1, (width - 1) // 2 + 1))
+        depth, height, width = shapes[-1]
+        shapes.append(((depth - 3) // 2 + 1, height, width))
+        return tuple(shapes)
+
+    @property
+    def stride(self) -> int:
+        """Voxels per BEV cell along x and y."""
+        return 2 ** (len(self.stages) - 1)
+
+
+@dataclass(frozen=True)
+class NeckConfig:
+    """From the BEV map to the head's features.
+
+    "ssfa" is the paper's (section 3.2, SPEC section 5), whose semantic branch has twice the spatial channels. Table 4
+    compares it with the others: "second" has seven 3 x 3 convolutions, "sassd" seven of twice the channels and one of
+    1 x 1.
+    """
+
+    kind: Literal["ssfa", "second", "sassd"] = "ssfa"
+    channels: int = 128
+    attention_kernel: Literal[1, 3] = 3
+
+    def __post_init__(self) -> None:
+        if self.channels < 1 or self.attention_kernel not in (1, 3):
+            raise ValueError(f"neck {self}: channels must be at least 1 and attention_kernel 1 or 3.")
+        if self.kind not in ("ssfa", "second", "sassd"):
+            raise ValueError(f"neck.kind: {self.kind!r} is unknown; choose 'ssfa', 'second' or 'sassd'.")
+
+
+@dataclass(frozen=True)
+class ClassConfig:
+    """One class and its anchor: size in metres, height of the anchor's centre, matching thresholds."""
+
+    name: str = "Car"
+    width: float = 1.6
+    length: float = 3.9
+    height: float = 1.56
+    center_z: float = -1.0
+    matched: float = 0.6
+    unmatched: float = 0.45
+    # A detection needs this much IoU-weighted support (mu of Algorithm 1).
+    support_threshold: float = 2.6
+    # Label names that count as this class in training (paper section 4.1: vans are cars).
+    similar: tuple[str, ...] = ()
+    # Objects are pasted until a scene holds so many of this name, none for 0 (SPEC section 2.3).
+    gt_sampling_up_to: int = 0
+    # A database object needs so many points.
+    gt_sampling_min_points: int = 5
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.length, self.height) <= 0:
+            raise ValueError(f"class {self.name}: width, length and height must be positive.")
+        if not 0 < self.unmatched <= self.matched <= 1:
+            raise ValueError(f"class {self.name}: thresholds must satisfy 0 < unmatched <= matched <= 1.")
+        if self.gt_sampling_up_to < 0 or self.gt_sampling_min_points < 1:
+            raise ValueError(
+                f"class {self.name}: gt_sampling_up_to must be at least 0 and gt_sampling_min_points at least 1."
+            )
+
+
+CAR = ClassConfig(similar=("Van",), gt_sampling_up_to=15)
+
+
+@dataclass(frozen=True)
+class HeadConfig:
+    """Multi-task head (paper section 3.3, SPEC section 6); `angles` are the anchors' r in radians."""
+
+    angles: tuple[float, ...] = (0.0, math.pi / 2)
+    # Without the IoU branch every box counts as a perfect one: the confidence is the class probability.
+    predict_iou: bool = True
+    iou_kernel: Literal[1, 3] = 1
+    iou_bias: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.angles or self.iou_kernel not in (1, 3):
+            raise ValueError(f"head {self}: at least one angle is needed, and iou_kernel must be 1 or 3.")
+
+
+@dataclass(frozen=True)
+class DetectionConfig:
+    """From raw predictions to boxes (paper section 3.4 and Algorithm 1, SPEC section 10)."""
+
+    score_threshold: float = 0.3
+    max_candidates: int = 1000
+    iou_exponent: float = 4.0
+    clamp_iou: bool = True
+    nms: Literal["paper", "released", "rotated"] = "paper"
+    nms_iou_threshold: float = 0.3
+    # sigma squared of the Gaussian weight for boxes nearer than each distance; the last serves all beyond.
+    sigma_squared: tuple[float, float, float, float] = (0.0009, 0.009, 0.1, 1.0)
+    sigma_distances: tuple[float, float, float] = (20.0, 40.0, 60.0)
+    z_limits: tuple[float, float] = (-5.0, 5.0)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.score_threshold < 1:
+            raise ValueError(f"detection.score_threshold: {self.score_threshold} is outside [0, 1).")
+        if self.max_candidates < 1:
+            raise ValueError("detection.max_candidates must be at least 1.")
+        if self.nms not in ("paper", "released", "rotated"):
+            raise ValueError(f"detection.nms: {self.nms!r} is unknown; choose 'paper', 'released' or 'rotated'.")
+        if min(self.sigma_squared) <= 0 or list(self.sigma_distances) != sorted(self.sigma_distances):
+            raise ValueError("detection: sigma_squared must be positive and sigma_distances ascending.")

@@ -1,0 +1,106 @@
+"""The whole network: the architecture figure in code (paper Figure 2)."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from ciassd_jax.config import Config, GridConfig
+from ciassd_jax.model.backbone import SPConvNet
+from ciassd_jax.model.head import MultiTaskHead
+from ciassd_jax.model.neck import SSFA, ConvolutionStack
+from ciassd_jax.ops.voxelize import voxelize
+from ciassd_jax.types import PointCloud, Predictions, SparseVoxels, Variables
+
+
+class CIASSD(nn.Module):
+    """Voxels of a batch of scenes to raw predictions for every anchor."""
+
+    config: Config
+    axis_name: str | None = None
+
+    @nn.compact
+    def __call__(
+        self, voxels: SparseVoxels, *, train: bool = False
+    ) -> tuple[Predictions, Int[Array, "B S"], Int[Array, "B S"]]:
+        """Predictions, and the active sites kept and dropped at each strided stage of the backbone."""
+        config, dtype = self.config, jnp.dtype(self.config.dtype)
+        backbone = SPConvNet(config.backbone, config.grid.shape, dtype, self.axis_name, name="backbone")
+        bev, kept, dropped = backbone(voxels, train=train)
+        neck = SSFA if config.neck.kind == "ssfa" else ConvolutionStack
+        features = neck(config.neck, dtype, self.axis_name, name="neck")(bev, train=train)
+        head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, name="head")
+        return head(features), kept, dropped
+
+
+def init_variables(key: Array, config: Config) -> Any:
+    """Fresh {"params", "batch_stats"}, initialised as in the released code; the whole tree is float32."""
+    none = jnp.zeros(1, jnp.int32)
+    slot = jnp.zeros((1, 1), jnp.int32)
+    voxels = SparseVoxels(
+        features=jnp.zeros((1, 1, 4)),
+        coordinates=jnp.zeros((1, 1, 3), jnp.int32),
+        num_points=slot,
+        first_point=slot,
+        count=none,
+        dropped=none,
+        points_in_range=none,
+        points_dropped=none,
+    )
+    init = CIASSD(config).init
+    if isinstance(key, jax.core.Tracer):
+        return init(key, voxels)
+    # Run once, so the time is in the compiler: without optimisation it takes a fifth.
+    return jax.jit(init, compiler_options={"xla_backend_optimization_level": 0})(key, voxels)
+
+
+class RawPredictions(NamedTuple):
+    """The network's output for a batch and what it used: the part of `predict` before post-processing."""
+
+    predictions: Predictions
+    voxels: SparseVoxels
+    sites_kept: Array
+    sites_dropped: Array
+
+
+def voxelize_batch(cloud: PointCloud, grid: GridConfig) -> SparseVoxels:
+    """Voxelise a batch of padded clouds as the config says."""
+    return jax.vmap(
+        partial(
+            voxelize,
+            minimum=grid.minimum,
+            voxel_size=grid.voxel_size,
+            cells=grid.cells,
+            shape=grid.shape,
+            max_points=grid.max_points_per_voxel,
+            max_voxels=grid.max_voxels,
+            overflow=grid.overflow,
+        )
+    )(cloud)
+
+
+def predict_raw(state_or_variables: Variables, cloud: PointCloud, config: Config) -> RawPredictions:
+    """Voxelise and run the network in evaluation mode; `cloud` has a leading batch axis."""
+    with jax.named_scope("voxelize"):
+        voxels = voxelize_batch(cloud, config.grid)
+    return predict_voxels(state_or_variables, voxels, config)
+
+
+def predict_voxels(state_or_variables: Variables, voxels: SparseVoxels, config: Config) -> RawPredictions:
+    """Run the network in evaluation mode on a batch of voxelised scenes."""
+    output: Any = CIASSD(config).apply(variables_of(state_or_variables), voxels)
+    predictions, kept, dropped = output
+    return RawPredictions(predictions, voxels, kept, dropped)
+
+
+def variables_of(state_or_variables: Variables) -> Variables:
+    """{"params", "batch_stats"} of a train state, with the running mean where it has one, or of a dictionary."""
+    if isinstance(state_or_variables, dict):
+        return {name: state_or_variables[name] for name in ("params", "batch_stats")}
+    state = state_or_variables
+    return {"params": state.params if state.ema is None else state.ema, "batch_stats": state.batch_stats}

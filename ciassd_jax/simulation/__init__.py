@@ -1,0 +1,11 @@
+"""Synthetic street scenes, as a 64-beam LiDAR would see them, with KITTI's labels.
+
+`open_synthetic` is a data set that is simulated as it is read, `write_synthetic` a folder in KITTI's layout;
+`simulate` is the pure function beneath both: from a key to a cloud and its objects.
+"""
+
+from ciassd_jax.simulation.sensor import Lidar
+from ciassd_jax.simulation.street_folder import make_frames, write_synthetic
+from ciassd_jax.simulation.streets import frame_key, make_frame, open_synthetic, simulate
+
+__all__ = ["Lidar", "frame_key", "make_frame", "make_frames", "open_synthetic", "simulate", "write_synthetic"]

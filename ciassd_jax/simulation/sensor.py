@@ -1,0 +1,157 @@
+"""The sensor: what a Velodyne HDL-64E records of a world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from ciassd_jax.simulation.casting import TILE, Rays, cast
+from ciassd_jax.simulation.ground import cast_ground
+from ciassd_jax.simulation.layout import World
+from ciassd_jax.simulation.materials import MATERIALS
+from ciassd_jax.types import Array, PointCloud
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """The sensor's numbers: those of the HDL-64E as its full KITTI frames show them.
+
+    Two blocks of beams between two elevations in degrees each; columns are azimuths, evenly spaced round the circle.
+    `noise` is the standard deviation of a range and `max_range` the farthest return in metres, `lost` the part of the
+    rays that never returns from anywhere.
+    """
+
+    upper: tuple[float, float, int] = (2.4, -7.85, 32)
+    lower: tuple[float, float, int] = (-8.4, -23.7, 32)
+    columns: int = 2176
+    noise: float = 0.02
+    lost: float = 0.01
+    max_range: float = 80.0
+    # Pairs of a solid and a tile of 16 x 16 rays (`casting`).
+    max_pairs: int = 4096
+
+    def __post_init__(self) -> None:
+        if (self.upper[2] + self.lower[2]) % TILE or self.columns % TILE or self.columns < TILE:
+            raise ValueError(f"lidar: the numbers of beams and of columns must be multiples of {TILE}.")
+
+    def rays(self) -> Rays:
+        """Its directions; the first column looks back."""
+        elevation = np.deg2rad(np.concatenate([np.linspace(*self.upper), np.linspace(*self.lower)]))
+        azimuth = (np.arange(self.columns) / self.columns * 2 - 1) * np.pi
+        return Rays(jnp.asarray(azimuth, jnp.float32), jnp.asarray(np.tan(elevation), jnp.float32))
+
+
+class Draws(NamedTuple):
+    """What chance gives every ray: a range error and a spread of intensity (standard normal), whether it returns
+    (uniform), and how far it strays into leaves and cabins (exponential)."""
+
+    error: Float[Array, "*s rows columns"]
+    spread: Float[Array, "*s rows columns"]
+    fate: Float[Array, "*s rows columns"]
+    stray: Float[Array, "*s rows columns"]
+
+
+class Sight(NamedTuple):
+    """What every ray meets first, whether it returns or not.
+
+    `range` is the distance in metres, inf for nothing; `cosine` that of incidence; `owner` the object, -1 for none.
+    `dropped` counts pairs over capacity (`casting.Hits`).
+    """
+
+    range: Float[Array, "*s rows columns"]
+    cosine: Float[Array, "*s rows columns"]
+    material: Int[Array, "*s rows columns"]
+    shade: Float[Array, "*s rows columns"]
+    owner: Int[Array, "*s rows columns"]
+    dropped: Int[Array, "*s"]
+
+
+def scan(key: jax.Array, world: World, lidar: Lidar) -> tuple[PointCloud, Sight]:
+    """One turn of the sensor: the points that it records beam by beam, and what its rays met."""
+    draws = _draw(key, lidar)
+    sight = _look(world, draws, lidar)
+    return _record(sight, draws, lidar), sight
+
+
+# Each step is a program of its own: in one program XLA fuses across the steps and computes much of them several times.
+@partial(jax.jit, static_argnames="lidar")
+def _draw(key: jax.Array, lidar: Lidar) -> Draws:
+    shape = (lidar.upper[2] + lidar.lower[2], lidar.columns)
+    bits = jax.random.bits(key, (4, *shape))
+    # From below 1, so that the logarithm is finite.
+    uniform = (bits[2:] >> 8).astype(jnp.float32) * 2.0**-24
+    return Draws(_bell(bits[0]), _bell(bits[1]), uniform[0], -jnp.log1p(-uniform[1]))
+
+
+def _bell(bits: Array) -> Array:
+    """Mean 0 and deviation 1 from random bits: the sum of four bytes, which lies within 3.5 deviations."""
+    total = sum((bits >> shift & 255).astype(jnp.float32) for shift in (0, 8, 16, 24))
+    return (total - 510.0) / np.sqrt(4 * (256**2 - 1) / 12).astype(np.float32)
+
+
+@partial(jax.jit, static_argnames="lidar")
+def _look(world: World, draws: Draws, lidar: Lidar) -> Sight:
+    """Cast the rays at the solids and the ground."""
+    rays, depth = lidar.rays(), jnp.array(MATERIALS)[world.solids.material, 3]
+    hits = cast(world.solids, depth, rays, draws.stray, lidar.max_pairs)
+    ground = cast_ground(world.ground, rays.azimuth, rays.tangent, _waves(draws.error))
+    solid = jnp.where(hits.distance < ground[0], hits.solid, -1)
+    found = solid >= 0
+    return Sight(
+        range=jnp.minimum(hits.distance, ground[0]) * jnp.sqrt(1 + rays.tangent**2)[:, None],
+        cosine=jnp.where(found, hits.cosine, ground[1]),
+        material=jnp.where(found, world.solids.material[solid], ground[2]),
+        shade=jnp.where(found, world.solids.shade[solid], world.ground.shade),
+        owner=jnp.where(found, world.solids.owner[solid], -1),
+        dropped=hits.dropped,
+    )
+
+
+@partial(jax.jit, static_argnames="lidar")
+def _record(sight: Sight, draws: Draws, lidar: Lidar) -> PointCloud:
+    """The rays that return, as points."""
+    rays, surface = lidar.rays(), jnp.array(MATERIALS)[sight.material]
+    signal = _signal(surface, sight, draws.spread)
+    returned = (draws.fate < _likelihood(surface, signal, sight, lidar)) & (sight.range < lidar.max_range)
+    noisy = jnp.where(returned, sight.range, 0.0) + lidar.noise * draws.error
+    flat = noisy / jnp.sqrt(1 + rays.tangent**2)[:, None]
+    x, y = jnp.cos(rays.azimuth)[None], jnp.sin(rays.azimuth)[None]
+    return _compact((flat * x, flat * y, flat * rays.tangent[:, None], signal), returned)
+
+
+def _waves(noise: Float[Array, "rows columns"]) -> Array:
+    """Standard normal numbers that go together over 16 columns, as bumps of the ground do, from independent ones."""
+    for shift in (1, 2, 4, 8):
+        noise = (noise + jnp.roll(noise, shift, 1)) * 0.5**0.5
+    return noise
+
+
+def _signal(surface: Float[Array, "rows columns 4"], sight: Sight, spread: Float[Array, "rows columns"]) -> Array:
+    """Intensity in hundredths, as KITTI's: reflectance by material and shade, less at flat angles."""
+    glossy = surface[..., 0] >= 1
+    angle = jnp.where(glossy, 0.15 + 0.55 * sight.cosine**2, 0.75 + 0.25 * sight.cosine)
+    level = surface[..., 0] * sight.shade * angle + surface[..., 1] * spread * jnp.sqrt(sight.shade)
+    return jnp.round(100 * jnp.clip(level, 0.0, 0.99)) / 100
+
+
+def _likelihood(
+    surface: Float[Array, "rows columns 4"], signal: Float[Array, "rows columns"], sight: Sight, lidar: Lidar
+) -> Array:
+    """How likely rays return: seldom from far away, from flat angles, dark surfaces and windows."""
+    energy = (0.035 + signal) * (0.05 + jnp.maximum(sight.cosine, 0)) * (30.0 / sight.range) ** 2
+    return (1 - surface[..., 2]) * (1 - lidar.lost) * (1 - jnp.exp(-60 * energy))
+
+
+def _compact(columns: tuple[Array, ...], kept: Array) -> PointCloud:
+    """The points that are kept, beam by beam, then zeros."""
+    kept = kept.reshape(-1)
+    place = jnp.where(kept, jnp.cumsum(kept) - 1, kept.size)
+    # Column by column: in one scatter XLA would compute every point once for each of its four columns.
+    packed = [jnp.zeros(kept.size).at[place].set(values.reshape(-1), mode="drop") for values in columns]
+    return PointCloud(jnp.stack(packed, -1), kept.sum(dtype=jnp.int32))

@@ -1,0 +1,135 @@
+"""Synthetic frames as a folder in KITTI's layout."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from ciassd_jax.data.kitti import FULL, IMAGE
+from ciassd_jax.formats.errors import InputError, Pathlike
+from ciassd_jax.formats.kitti import lidar_to_image, write_rows
+from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.points import write_bin
+from ciassd_jax.formats.writing import check_folder, replacing, write_text
+from ciassd_jax.ops.camera import project
+from ciassd_jax.simulation.sensor import Lidar
+from ciassd_jax.simulation.streets import SyntheticFrame, make_frame
+from ciassd_jax.simulation.virtual_camera import calibration_text
+
+# Says whose folder it is, so that nothing else is ever overwritten.
+MARK = "synthetic.txt"
+_PARTS = ("training", "ImageSets", MARK)
+# Every fourth frame is of the split val.
+_VALIDATION = 4
+# A depth image spans these metres, near ones bright; a point is this many pixels wide and high.
+_DEPTHS, _DOT = (3.0, 80.0), 3
+
+
+def write_synthetic(
+    out: Pathlike,
+    *,
+    frames: int,
+    seed: int,
+    overwrite: bool = False,
+    lidar: Lidar | None = None,
+    track: Callable[[range], Iterable[int]] = iter,
+) -> int:
+    """Write frames 0 to `frames` - 1 of a seed as OUT/training and OUT/ImageSets; returns the pairs over capacity.
+
+    Frames 3, 7, 11, ... are the split val, the others train. Frame i depends on the seed and i alone. `overwrite`
+    replaces what this function wrote there before. `track` sees the frames go by, for a progress bar. Raises
+    InputError for a folder that cannot be used, and without pillow.
+    """
+    folder = Path(out)
+    _require_pillow()
+    _clear(folder, overwrite)
+    write_text(folder / MARK, f"{frames} synthetic frames of seed {seed}, written by `ciassd data synth`")
+    names = [f"{index:06d}" for index in range(frames)]
+    validation = [name for index, name in enumerate(names) if index % _VALIDATION == _VALIDATION - 1]
+    training = [name for index, name in enumerate(names) if index % _VALIDATION != _VALIDATION - 1]
+    for split, some in (("train", training), ("val", validation), ("trainval", names)):
+        with replacing(folder / "ImageSets" / f"{split}.txt") as temporary:
+            temporary.write_text("".join(f"{name}\n" for name in some))
+    made = make_frames(seed, range(frames), lidar)
+    return sum(_write_frame(folder / "training", names[index], next(made)) for index in track(range(frames)))
+
+
+def make_frames(seed: int, indices: Iterable[int], lidar: Lidar | None = None) -> Iterator[SyntheticFrame]:
+    """Frames in order, made by a thread for every core."""
+    threads = os.cpu_count() or 1
+    pending: deque = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        for index in indices:
+            pending.append(pool.submit(make_frame, seed, index, lidar))
+            if len(pending) > threads:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+
+
+def _clear(folder: Path, overwrite: bool) -> None:
+    """Make room in the folder, or say why not."""
+    check_folder(folder)
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not overwrite:
+        raise InputError(f"{folder} is not empty; name another folder, or replace what is there with --overwrite.")
+    if not (folder / MARK).is_file():
+        raise InputError(f"{folder} was not written by `ciassd data synth`, so it stays; name another folder.")
+    for part in _PARTS:
+        path = folder / part
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _write_frame(folder: Path, name: str, frame: SyntheticFrame) -> int:
+    """Write the four files of a frame; returns the pairs over capacity."""
+    with replacing(folder / FULL.format(name)) as temporary:
+        write_bin(temporary, frame.points)
+    with replacing(folder / f"calib/{name}.txt") as temporary:
+        temporary.write_text(calibration_text())
+    with replacing(folder / f"label_2/{name}.txt") as temporary:
+        write_rows(temporary, frame.rows)
+    with replacing(folder / IMAGE.format(name)) as temporary:
+        _write_png(temporary, depth_image(frame.points, frame.camera))
+    return frame.dropped
+
+
+def depth_image(points: Float32[np.ndarray, "P 4"], camera: Camera) -> UInt8[np.ndarray, "H W"]:
+    """What the camera sees of the points: bright is near, black is nothing; brightness falls with the inverse depth."""
+    width, height = camera.image_size
+    pixels, depth = project(points[:, :3].astype(np.float64), lidar_to_image(camera.calibration))
+    near, far = _DEPTHS
+    seen = (depth > near) & (depth < far)
+    pixels, depth = pixels[seen], depth[seen]
+    bright = 30 + 225 * (1 / depth - 1 / far) / (1 / near - 1 / far)
+    image = np.zeros((height, width), np.uint8)
+    corner = np.floor(pixels).astype(np.int64) - _DOT // 2
+    for right in range(_DOT):
+        for down in range(_DOT):
+            u, v = corner[:, 0] + right, corner[:, 1] + down
+            inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+            np.maximum.at(image, (v[inside], u[inside]), bright[inside].astype(np.uint8))
+    return image
+
+
+def _require_pillow() -> None:
+    try:
+        import PIL.Image  # noqa: F401
+    except ModuleNotFoundError:
+        raise InputError("Depth images need pillow; get it with `pip install 'ciassd_jax[viz]'`.") from None
+
+
+def _write_png(path: Path, image: UInt8[np.ndarray, "H W"]) -> None:
+    from PIL import Image
+
+    Image.fromarray(image).save(path, format="PNG", compress_level=1)

@@ -1,0 +1,59 @@
+"""The optimiser and its schedules."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax.numpy as jnp
+import optax
+
+from ciassd_jax.config import ScheduleConfig
+from ciassd_jax.types import Array
+
+
+def learning_rate(step: int | Array, schedule: ScheduleConfig) -> Array:
+    """Learning rate of an update, from 0: one cycle with two half cosines, or one half cosine down to 0."""
+    updates = _num_updates(schedule)
+    if schedule.kind == "cosine":
+        return jnp.asarray(optax.cosine_decay_schedule(schedule.learning_rate, updates)(step))
+    low = schedule.learning_rate / schedule.div_factor
+    return _cycle(step, schedule, low, schedule.learning_rate, low / schedule.final_div_factor)
+
+
+def momentum(step: int | Array, schedule: ScheduleConfig) -> Array:
+    """Adam's first decay of an update, from 0: the mirror image of the learning rate in one cycle, else constant."""
+    high, low = schedule.b1_range
+    return _cycle(step, schedule, high, low, high) if schedule.kind == "one_cycle" else jnp.asarray(high)
+
+
+def _num_updates(schedule: ScheduleConfig) -> int:
+    return max(schedule.total_steps // schedule.gradient_accumulation_steps, 1)
+
+
+def _cycle(step: int | Array, schedule: ScheduleConfig, start: float, middle: float, end: float) -> Array:
+    """Half a cosine from `start` to `middle` over the warm-up, and half a cosine to `end` over the rest."""
+    updates = _num_updates(schedule)
+    turn = int(schedule.warmup * updates)
+    rise = jnp.clip(jnp.asarray(step) / max(turn, 1), 0, 1)
+    fall = jnp.clip((jnp.asarray(step) - turn) / (updates - turn), 0, 1)
+    up = middle + (start - middle) / 2 * (1 + jnp.cos(jnp.pi * rise))
+    down = end + (middle - end) / 2 * (1 + jnp.cos(jnp.pi * fall))
+    return jnp.where(jnp.asarray(step) < turn, up, down)
+
+
+def make_optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
+    """Norm clipping, Adam with the scheduled momentum, decoupled weight decay of all parameters, the learning rate.
+
+    With `accumulate` the mean gradient of so many steps makes one update; the schedules count updates.
+    """
+    adam = optax.inject_hyperparams(optax.scale_by_adam, static_args=("b2", "eps"))
+    chain = optax.chain(
+        optax.clip_by_global_norm(schedule.max_gradient_norm),
+        adam(b1=partial(momentum, schedule=schedule), b2=schedule.b2, eps=1e-8),
+        optax.add_decayed_weights(schedule.weight_decay),
+        optax.scale_by_learning_rate(partial(learning_rate, schedule=schedule)),
+    )
+    if schedule.gradient_accumulation_steps == 1:
+        return chain
+    steps = optax.MultiSteps(chain, schedule.gradient_accumulation_steps)
+    return optax.GradientTransformation(steps.init, steps.update)

@@ -1,0 +1,85 @@
+"""Scores while training goes on: average precision on a data set, and whether one frame was learnt by heart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from ciassd_jax.config import Config
+from ciassd_jax.data.frames import Dataset
+from ciassd_jax.data.scenes import target_labels
+from ciassd_jax.evaluation import Evaluation, format_json, format_report
+from ciassd_jax.evaluation.kitti_ap import LIMITS
+from ciassd_jax.formats.kitti_camera import frustum_of
+from ciassd_jax.formats.writing import write_text
+from ciassd_jax.inference.detector import Detector
+from ciassd_jax.inference.scoring import detect_dataset, score_frames, write_frames
+from ciassd_jax.model.network import variables_of
+from ciassd_jax.ops.iou import iou_3d
+from ciassd_jax.types import Boxes, Variables
+
+
+class Validation:
+    """Scores ever newer weights on one data set; the programs are compiled once."""
+
+    def __init__(self, dataset: Dataset, config: Config) -> None:
+        self._dataset, self._config = dataset, config
+        self._detector: Detector | None = None
+
+    def score(self, state_or_variables: Variables, folder: Path) -> dict[str, float]:
+        """AP of the weights, and in `folder` its whole result.json and table.txt, and data/NAME.txt of every frame."""
+        variables = jax.device_get(variables_of(state_or_variables))
+        if self._detector is None:
+            self._detector = Detector(variables, self._config)
+        detector = self._detector.with_variables(variables)
+        frames = detect_dataset(detector, self._dataset)
+        evaluation = score_frames(frames)
+        write_frames(frames, folder / "data")
+        write_text(folder / "result.json", format_json(evaluation))
+        write_text(folder / "table.txt", format_report(evaluation))
+        return precisions(evaluation, self._config)
+
+
+def precisions(evaluation: Evaluation, config: Config) -> dict[str, float]:
+    """AP R40 moderate in percent, in 3D and BEV at both limits, of the first class that KITTI's rules know.
+
+    The first number is 3D's at the strict limit. Where nothing is detected the official program evaluates nothing; that
+    is 0 here.
+    """
+    name = next((name for name in config.class_names if name in LIMITS), None)
+    found = {}
+    for metric in ("3d", "bev"):
+        for limit in LIMITS[name] if name is not None else ():
+            precision = evaluation.precision(name, metric, limit) if name is not None else None
+            moderate = precision[1] if precision is not None else 0.0
+            found[f"{name}_{metric}_{limit:.2f}_moderate_R40"] = float(np.nan_to_num(moderate))
+    return found
+
+
+def count_found(
+    variables: Variables, dataset: Dataset, config: Config, limit: float = 0.7, *, hardest: int | None = None
+) -> tuple[int, int]:
+    """How many targets in all frames are found with their class and at least so much 3D overlap, and of how many.
+
+    Targets are the labelled objects of a class whose centre lies in the grid, of any difficulty, or of KITTI's up to
+    `hardest` (0 easy, 1 moderate, 2 hard).
+    """
+    detector, found, targets = Detector(jax.device_get(variables_of(variables)), config), 0, 0
+    low, high = np.array(config.grid.minimum), np.array(config.grid.maximum)
+    for index in range(len(dataset)):
+        frame = dataset.read(index)
+        result = detector.detect(frame.points, frustum=frustum_of(frame.camera))
+        boxes = Boxes.from_array(result.boxes.astype(np.float64))
+        label = target_labels(frame, config)
+        center = frame.boxes.center
+        wanted = (label >= 0) & ((center >= low) & (center <= high)).all(-1)
+        if hardest is not None:
+            wanted &= (frame.difficulty >= 0) & (frame.difficulty <= hardest)
+        for row in np.flatnonzero(wanted):
+            overlap = iou_3d(Boxes(*(leaf[row][None] for leaf in frame.boxes)), boxes)
+            same = np.array([name == config.class_names[label[row]] for name in result.labels], bool)
+            found += bool((same & (overlap >= limit)).any())
+            targets += 1
+    return found, targets

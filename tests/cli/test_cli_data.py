@@ -1,0 +1,211 @@
+"""`ciassd data check`, `data prepare`, `data synth` and `submit`: exit codes, and what they print and write."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from mini_folders import NAMES, OBJECTS, object_points, write_custom, write_kitti, write_split
+
+from ciassd_jax.cli import main
+from ciassd_jax.data.folders import open_dataset
+from ciassd_jax.data.gt_sampling import fingerprint_of, open_database
+from ciassd_jax.evaluation.check_scores import find_imperfect, score_truth
+from ciassd_jax.evaluation.dataset_check import check_dataset
+from ciassd_jax.formats.kitti import read_rows, write_rows
+from ciassd_jax.formats.points import write_bin
+from ciassd_jax.simulation import Lidar
+
+
+class Run(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., Run]:
+    def call(*arguments: object) -> Run:
+        code = main([str(argument) for argument in arguments])
+        return Run(code, *capsys.readouterr())
+
+    return call
+
+
+def test_sound_data_pass_the_check(run: Any, tmp_path: Path) -> None:
+    result = run("data", "check", write_kitti(tmp_path), "--preset", "tiny")
+    assert result.code == 0
+    lines = result.out.splitlines()
+    assert lines[0].split() == ["3", "frames", "least", "median", "most"]
+    assert lines[-1] == "0 findings must be mended, 0 are worth a look."
+    assert lines[-2] == "By the official rule fewer than 41 objects cannot score 100, however well they are found."
+    assert ["Car", "3", "0", "0", "3.90", "1.60", "1.50", "-1.00"] in [line.split() for line in lines]
+    # Three cars give three points of 41, the first of which R40 leaves out.
+    assert ["Car", "3d", "5.00", "5.00", "5.00", "3,", "3,", "3"] in [line.split() for line in lines]
+
+
+def test_what_must_be_mended_is_exit_code_1(run: Any, tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    write_split(root, "train", "000000", "000009")
+    path = root / "training/label_2/000001.txt"
+    path.write_text(path.read_text() + "Car\n")
+    result = run("data", "check", root, "--preset", "tiny")
+    assert result.code == 1
+    first, second, *_, last = result.out.splitlines()
+    assert first.startswith(f"error: {root}/ImageSets/train.txt: 1 of 2 frames have no cloud")
+    assert second.startswith(f"error: {path}, line 5: 1 columns; a label has 15")
+    assert last == "2 findings must be mended, 0 are worth a look."
+
+
+def test_what_is_odd_is_listed_up_to_most(run: Any, tmp_path: Path) -> None:
+    root = write_kitti(tmp_path, clouds="velodyne_reduced")
+    for name in NAMES:
+        write_bin(root / f"training/velodyne_reduced/{name}.bin", object_points(0)[:120])
+    result = run("data", "check", root, "--most", 2, "--preset", "tiny")
+    assert result.code == 0
+    lines = result.out.splitlines()
+    assert [line.split(":")[0] for line in lines[:3]] == ["odd"] * 3
+    assert lines[2] == "odd: ... and 1 more of this kind (no point); --most lists more."
+    assert lines[-1] == "0 findings must be mended, 3 are worth a look."
+
+
+def test_custom_data_are_checked_without_a_camera(run: Any, tmp_path: Path) -> None:
+    result = run("data", "check", write_custom(tmp_path), "--preset", "tiny")
+    assert result.code == 0
+    rows = [line.split()[:2] for line in result.out.splitlines()]
+    assert ["Car", "3d"] in rows
+    assert ["Car", "bbox"] not in rows
+
+
+def test_test_frames_have_no_scores(run: Any, tmp_path: Path) -> None:
+    root = write_kitti(tmp_path, part="testing")
+    write_split(root, "test", *NAMES)
+    result = run("data", "check", root, "--split", "test", "--preset", "tiny")
+    assert result.code == 0
+    assert "Labels as detections" not in result.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("data", "check", "nowhere"), "error: nowhere has no folder training or testing (KITTI) or points"),
+        (("data", "prepare", "nowhere"), "error: nowhere has no folder training or testing (KITTI) or points"),
+        (("submit", "nowhere", "a.zip"), "error: nowhere is no folder; name the one that holds the results."),
+        (("submit", "nowhere", "a.tar"), "error: a.tar must end in .zip; name the archive so."),
+    ],
+)
+def test_bad_input_is_exit_code_2_and_one_sentence(run: Any, arguments: tuple[str, ...], message: str) -> None:
+    result = run(*arguments)
+    assert (result.code, result.out) == (2, "")
+    assert result.err.startswith(message)
+    assert result.err.count("\n") == 1
+
+
+def test_the_folder_comes_from_the_environment(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KITTI_ROOT", str(write_kitti(tmp_path)))
+    assert run("data", "check", "--preset", "tiny").code == 0
+
+
+def test_prepare_writes_the_database(run: Any, tmp_path: Path) -> None:
+    root = write_kitti(tmp_path / "kitti")
+    result = run("data", "prepare", root, "--split", "all", "--out", tmp_path / "out")
+    assert result.code == 0
+    path = tmp_path / "out" / "objects_all.bin"
+    assert result.out == f"Wrote the objects of 3 frames to {path}.\n"
+    database = open_database(path, fingerprint_of(open_dataset(root, "all")))
+    assert len(database.objects) == 3 * len(OBJECTS)
+    assert not (root / "training/velodyne_reduced").exists()
+
+
+def test_prepare_reduces_clouds_when_asked(run: Any, tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    before = open_dataset(root, "all").read(0).points
+    result = run("data", "prepare", root, "--split", "all", "--reduce")
+    assert (result.code, result.out.splitlines()[0]) == (0, "Wrote 3 cropped clouds.")
+    assert (root / "objects_all.bin").is_file()
+    np.testing.assert_array_equal(open_dataset(root, "all").read(0).points, before)
+    assert len(list((root / "training/velodyne_reduced").glob("*.bin"))) == 3
+
+
+def test_prepare_cannot_reduce_without_a_camera(run: Any, tmp_path: Path) -> None:
+    result = run("data", "prepare", write_custom(tmp_path), "--reduce")
+    assert result.code == 2
+    assert result.err == f"error: {tmp_path} has no camera to crop clouds to; leave out --reduce.\n"
+
+
+def test_synth_writes_a_folder_that_passes_the_check(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fewer columns than the real sensor has: the test is of the command.
+    monkeypatch.setattr("ciassd_jax.simulation.streets.Lidar", lambda: Lidar(columns=512))
+    root = tmp_path / "synth"
+    result = run("data", "synth", root, "--frames", 4, "--seed", 1)
+    assert (result.code, result.out, result.err) == (0, f"Wrote 4 frames to {root}.\n", "")
+    assert (root / "ImageSets/val.txt").read_text() == "000003\n"
+    assert run("data", "check", root).code == 0
+    again = run("data", "synth", root)
+    assert (again.code, again.out) == (2, "")
+    assert again.err == (
+        f"error: {root} is not empty; name another folder, or replace what is there with --overwrite.\n"
+    )
+    assert run("data", "synth", root, "--frames", 1, "--overwrite").code == 0
+    assert [path.name for path in (root / "training/velodyne").iterdir()] == ["000000.bin"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--frames", 0), "error: --frames 0 makes no data set; ask for at least 1.\n"),
+        (("--seed", -1), "error: --seed -1 is outside 0..2147483647; choose one inside.\n"),
+    ],
+)
+def test_synth_refuses_senseless_numbers(run: Any, tmp_path: Path, options: tuple, message: str) -> None:
+    result = run("data", "synth", tmp_path / "out", *options)
+    assert (result.code, result.out, result.err) == (2, "", message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_submit(run: Any, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    results.mkdir()
+    for frame in range(7518):
+        (results / f"{frame:06d}.txt").touch()
+    result = run("submit", results, tmp_path / "a.zip")
+    assert (result.code, result.out) == (0, f"Wrote {tmp_path / 'a.zip'} with 7518 files.\n")
+    (results / "000007.txt").write_text("Car\n")
+    (results / "000008.txt").unlink()
+    result = run("submit", results, tmp_path / "b.zip")
+    assert result.code == 1
+    assert result.out.splitlines()[0].startswith(f"{results}: 1 of 7518 files are missing (000008.txt); write one")
+    assert result.out.splitlines()[1].startswith(f"{results / '000007.txt'}, line 1: 1 columns")
+    assert result.out.splitlines()[2] == f"2 problems; {tmp_path / 'b.zip'} was not written."
+    assert not (tmp_path / "b.zip").exists()
+
+
+def test_labels_that_cover_each_other_score_less_than_is_possible(run: Any, tmp_path: Path) -> None:
+    """A detection too low for the level is neutral whatever its type: the car behind it takes it and is lost."""
+    root = write_kitti(tmp_path)
+    for name in NAMES:
+        path = root / f"training/label_2/{name}.txt"
+        car, van, pedestrian = (row for row in read_rows(path) if row.type != "DontCare")
+        low, high = (100.0, 100.0, 130.0, 124.9), (100.0, 100.0, 130.0, 126.0)
+        write_rows(path, [pedestrian._replace(bbox=low), van, car._replace(bbox=high)])
+    result = run("data", "check", root, "--preset", "tiny")
+    assert result.code == 1
+    lines = [line for line in result.out.splitlines() if line.startswith("error: ")]
+    remedy = "look for labels that cover each other."
+    assert lines == [
+        f"error: Car {metric}: labels as detections score 0.00, 0.00, 0.00 where 0.00, 5.00, 5.00 is possible; {remedy}"
+        for metric in ("bbox", "aos")
+    ]
+
+
+@pytest.mark.reference
+def test_real_labels_score_100_or_what_fewer_objects_can(shared: Path) -> None:
+    scores = score_truth(check_dataset(shared / "kitti").frames)
+    assert find_imperfect(scores) == []
+    by_class = {one.name: (one.objects, one.score) for one in scores if one.metric == "3d"}
+    assert by_class == {
+        "Car": ((132, 335, 451), (100, 100, 100)),
+        "Pedestrian": ((51, 74, 83), (100, 100, 100)),
+        "Cyclist": ((16, 28, 30), (37.5, 67.5, 72.5)),
+    }

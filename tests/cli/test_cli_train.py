@@ -1,0 +1,198 @@
+"""`ciassd train`, called in this process: it trains, goes on, and says in one sentence what it cannot use."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pytest
+from mini_training import STEPS, mini_config, share_training_programs, write_data
+from small import random_variables
+
+from ciassd_jax import create_train_state, load_weights, save_weights
+from ciassd_jax.cli import main
+from ciassd_jax.config.presets import PRESETS
+from ciassd_jax.data.folders import database_path
+from ciassd_jax.training import loop
+from ciassd_jax.training.loop import Fitted
+
+# One program of training and one of evaluation serve the whole file.
+_PROGRAMS: dict[Any, Any] = {}
+_compile = loop._Run._compile
+
+
+class Run(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture
+def run(root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
+    """Train the small network in place of `tiny`, in the program of `mini_fit` unless said otherwise, unscored."""
+
+    def call(*arguments: object, **options: object) -> Run:
+        chosen = {"preset": "tiny", "data": root, "batch-size": 2, "steps": STEPS, "evaluate-every": 0} | options
+        given = [text for name, value in chosen.items() if value is not None for text in (f"--{name}", str(value))]
+        code = main(["train", *given, *map(str, arguments)])
+        return Run(code, *capsys.readouterr())
+
+    share_training_programs(monkeypatch)
+    monkeypatch.setitem(PRESETS, "tiny", mini_config)
+    return call
+
+
+def steps_of(workdir: Path) -> list[int]:
+    return [json.loads(line)["step"] for line in (workdir / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_trains_and_goes_on(run: Callable[..., Run], root: Path, tmp_path: Path) -> None:
+    first = run(workdir=tmp_path, **{"log-every": 2})
+    assert first.code == 0, first.err
+    assert f"Collecting the objects to paste from 3 frames into {tmp_path}" in first.out
+    assert not database_path(root, "train").exists()
+    assert f"Trained 9 steps. Weights, metrics and evaluations are in {tmp_path}." in first.out
+    assert steps_of(tmp_path) == [2, 4, 6, 8, 9]
+    saved = load_weights(tmp_path / "last.safetensors").variables
+    again = run(workdir=tmp_path, **{"log-every": 2})
+    assert again.code == 0
+    assert "Going on from step 9 in " in again.out
+    assert "Collecting" not in again.out
+    jax.tree.map(np.testing.assert_array_equal, load_weights(tmp_path / "last.safetensors").variables, saved)
+
+
+def test_another_config_or_seed_is_one_sentence(run: Callable[..., Run], tmp_path: Path) -> None:
+    assert run(workdir=tmp_path).code == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for options, words in (
+        ({"weight-decay": 0.5}, "config.schedule.weight_decay is 0.01 there and 0.5 here"),
+        ({"seed": 7}, "seed 0 instead of 7"),
+    ):
+        refused = run(workdir=tmp_path, **options)
+        assert refused.code == 2
+        assert words in refused.err
+        assert refused.err.startswith("error: ")
+        assert refused.err.count("\n") == 1
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """What `fit` is called with; it trains nothing."""
+    calls: list[tuple[Any, ...]] = []
+
+    def stand_in(config: Any, batches: Any, workdir: Path, **options: Any) -> Fitted:
+        calls.append((config, batches._rows.stream, options))
+        variables = random_variables(config)
+        return Fitted(create_train_state(jax.random.key(0), config, variables=variables), None, None)
+
+    monkeypatch.setattr(fitting, "fit", stand_in)
+    return calls
+
+
+def test_starts_from_weights(run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path) -> None:
+    start = tmp_path / "start.safetensors"
+    save_weights(start, random_variables(mini_config(), seed=5), mini_config())
+    assert run(workdir=tmp_path / "w", **{"init-from": start}).code == 0
+    ((_, _, options),) = fits
+    jax.tree.map(np.testing.assert_array_equal, options["variables"], random_variables(mini_config(), seed=5))
+
+
+def test_overfit_one_takes_that_frame_alone_and_reports(
+    run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path
+) -> None:
+    done = run("--overfit-one", "000001", workdir=tmp_path, steps=None, **{"batch-size": None})
+    assert done.code == 1, done.err
+    assert "Frame 000001: 0 of 2 objects are found at a 3D overlap of 0.7." in done.out
+    ((config, stream, options),) = fits
+    assert (stream.dataset.names, stream.augmented, stream.database) == (("000001",), False, None)
+    # Found or not says more of one frame than its average precision.
+    assert options["validation"] is None
+    assert (config.schedule.total_steps, config.schedule.batch_size, config.schedule.learning_rate) == (800, 1, 1e-3)
+
+
+def test_options_go_to_the_config(run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path) -> None:
+    options = {"epochs": 6, "steps": None, "kind": "cosine", "dtype": "bfloat16", "seed": 4}
+    assert run(workdir=tmp_path, **options).code == 0
+    ((config, stream, _),) = fits
+    assert (config.schedule.total_steps, config.schedule.kind, config.dtype) == (9, "cosine", "bfloat16")
+    assert (stream.seed, stream.augmented) == (4, True)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"steps": 0}, "total_steps"),
+        ({"steps": 3, "epochs": 2}, "either --steps or --epochs"),
+        ({"workers": -1}, "workers"),
+        ({"seed": -1}, "seed is -1"),
+        ({"log-every": 0}, "must be at least 1"),
+        ({"learning-rate": 0}, "learning_rate must be positive"),
+        ({"overfit-one": "000777"}, "Frame 000777 is not among the 3 of train"),
+        ({"split": "none"}, "none"),
+        ({"data": "nowhere"}, "nowhere"),
+        ({"init-from": "nowhere.safetensors"}, "is no file"),
+        ({"num-processes": 2}, "give all three"),
+    ],
+)
+def test_what_cannot_be_used_is_one_sentence(
+    options: dict[str, object], words: str, run: Callable[..., Run], tmp_path: Path
+) -> None:
+    refused = run(workdir=tmp_path / "new", **options)
+    assert refused.code == 2
+    assert words in refused.err
+    assert refused.err.rstrip().splitlines()[-1].startswith("error: ")
+    assert "Traceback" not in refused.err
+    assert not (tmp_path / "new" / "checkpoints").exists()
+
+
+def test_a_workdir_that_cannot_be_is_one_sentence(run: Callable[..., Run], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("kept")
+    refused = run(workdir=tmp_path / "file" / "w")
+    assert (refused.code, refused.out) == (2, "")
+    assert refused.err == (
+        f"error: {tmp_path}/file/w cannot be a folder, as {tmp_path}/file is a file; choose another place.\n"
+    )
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_a_read_only_workdir_is_one_sentence(
+    run: Callable[..., Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The superuser may write everywhere.
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    refused = run(workdir=tmp_path)
+    assert (refused.code, refused.out) == (2, "")
+    assert refused.err == f"error: {tmp_path} cannot be written, as {tmp_path} is read-only; choose another place.\n"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        (9, "nan", "000004.txt, line 1: a value is not finite"),
+        (8, "-1.5", "Frame 000004: object 0 (Car) has the size"),
+        (0, "Lorry", "000004.txt: the type 'Lorry' is none of KITTI's"),
+    ],
+)
+def test_a_label_that_is_none_names_its_frame(
+    column: int, value: str, words: str, run: Callable[..., Run], tmp_path: Path
+) -> None:
+    data = write_data(tmp_path / "data")
+    label = data / "training" / "label_2" / "000004.txt"
+    fields = label.read_text().split(" ")
+    fields[column] = value
+    label.write_text(" ".join(fields))
+    refused = run(workdir=tmp_path / "w", data=data)
+    assert refused.code == 2
+    assert words in refused.err
+    assert refused.err.startswith("error: ")
+    assert refused.err.count("\n") == 1

@@ -1,0 +1,184 @@
+"""`Detector`: what goes in, what comes out, when it compiles and what it warns of."""
+
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small import random_variables, share_programs, small_cloud, small_config
+
+from ciassd_jax import Boxes, Detections, Detector, PointCloud, save_weights
+from ciassd_jax.formats.errors import DroppedWarning, InputError
+from ciassd_jax.inference.results import FrameResult
+from ciassd_jax.types import Counts
+
+
+@pytest.fixture
+def detector(monkeypatch: pytest.MonkeyPatch) -> Detector:
+    share_programs(monkeypatch)
+    return Detector(random_variables(small_config()), small_config())
+
+
+@pytest.fixture
+def quiet() -> Iterator[None]:
+    """The small network finds more candidates than it keeps; tests that are about something else ignore that."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Dropped .* candidates", DroppedWarning)
+        yield
+
+
+def drops(caught: Any) -> str:
+    return "\n".join(str(w.message) for w in caught if w.category is DroppedWarning)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_one_cloud_gives_one_result(detector: Detector) -> None:
+    result = detector(small_cloud())
+    assert isinstance(result, FrameResult)
+    assert len(result) > 0
+    assert result.boxes.shape == (len(result), 7)
+    assert result.scores.shape == (len(result),)
+    assert result.labels == ("Car",) * len(result)
+    assert (np.abs(result.boxes[:, 6]) <= np.pi).all()
+    assert result.seconds > 0
+    assert result.counts["points"]["given"] == len(small_cloud())
+    assert [set(stage) for stage in result.counts["sites"]] == [{"kept", "dropped"}] * 2
+
+
+@pytest.mark.usefixtures("quiet")
+def test_a_list_gives_a_list_and_neighbours_do_not_matter(detector: Detector) -> None:
+    clouds = [small_cloud(0), small_cloud(1, 50)]
+    together, alone = detector(clouds), [detector(cloud) for cloud in clouds]
+    assert isinstance(together, list)
+    for one, other in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(one.boxes, other.boxes)
+        np.testing.assert_array_equal(one.scores, other.scores)
+    assert detector([]) == []
+
+
+@pytest.mark.usefixtures("quiet")
+def test_jax_arrays_and_other_number_types_are_taken(detector: Detector) -> None:
+    expected = detector(small_cloud())
+    for points in (jnp.asarray(small_cloud()), small_cloud().astype(np.float64)):
+        np.testing.assert_array_equal(detector(points).boxes, expected.boxes)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_a_frustum_drops_what_no_camera_sees(detector: Detector) -> None:
+    everything = detector(small_cloud())
+    middle = np.median(everything.boxes[:, 0]) + 0.01
+    seen = detector(small_cloud(), frustum=np.tile([1.0, 0.0, 0.0, -middle], (6, 1)))
+    np.testing.assert_array_equal(seen.boxes, everything.boxes[everything.boxes[:, 0] > middle])
+    assert 0 < len(seen) < len(everything)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_points_that_are_not_finite_are_dropped_and_named(detector: Detector) -> None:
+    spoilt = small_cloud()
+    spoilt[[3, 5, 8], [0, 2, 3]] = [np.nan, np.inf, np.nan]
+    clean = np.delete(small_cloud(), [3, 5, 8], 0)
+    with pytest.warns(DroppedWarning, match=r"^Dropped 3 of 600 points that are not finite") as caught:
+        result = detector(spoilt)
+    assert result.counts["points"]["dropped"] == 3
+    assert "voxels" not in drops(caught)
+    np.testing.assert_allclose(result.boxes, detector(clean).boxes, atol=1e-6)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_intensity_of_a_byte_is_divided_and_named(detector: Detector) -> None:
+    byte, fraction = small_cloud(), small_cloud()
+    byte[:, 3] = (byte[:, 3] * 255).round()
+    fraction[:, 3] = byte[:, 3] / 255
+    with pytest.warns(DroppedWarning, match=r"^600 intensities of up to 2\d\d were divided by 255"):
+        result = detector(byte)
+    np.testing.assert_array_equal(result.boxes, detector(fraction).boxes)
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 4), np.float32), np.full((9, 4), 500, np.float32) * [1, 1, 1, 0]])
+def test_nothing_in_range_gives_an_empty_result(detector: Detector, points: np.ndarray) -> None:
+    with pytest.warns(DroppedWarning, match=f"^Dropped all {len(points)} points, none of which is in range.$"):
+        result = detector(points)
+    assert len(result) == 0
+    assert result.boxes.shape == (0, 7)
+    assert result.counts["voxels"] == {"kept": 0, "dropped": 0}
+
+
+def test_overflow_is_counted_and_named(detector: Detector) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([0, -6.4, -3, 0], [12.8, 6.4, 1, 1], (6000, 4)).astype(np.float32)
+    with pytest.warns(DroppedWarning) as caught:
+        counts = detector(points).counts
+    message = drops(caught)
+    assert f"{counts['voxels']['dropped']} voxels beyond the 2048 that fit (grid.max_voxels), with " in message
+    assert f"{counts['points']['dropped']} points" in message
+    assert f"{counts['sites'][0]['dropped']} sites of backbone stage 1 beyond the 2048 that fit" in message
+
+
+@pytest.mark.parametrize("shape", [(5, 3), (4,), (1, 5, 4)])
+def test_another_shape_is_refused(detector: Detector, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=f"points have the shape {re.escape(str(shape))}; give \\[N, 4\\]"):
+        detector(np.zeros(shape, np.float32))
+
+
+def test_every_bucket_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    traced = []
+
+    def nothing(variables: Any, cloud: PointCloud, config: Any, *, frustum: jax.Array) -> Detections:
+        traced.append(cloud.points.shape)
+        none = jnp.zeros_like(cloud.count)
+        boxes = Boxes(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)), jnp.zeros((1, 2)))
+        stages = jnp.zeros((1, 2), jnp.int32)
+        counts = Counts(cloud.count, cloud.count, none, none, none, stages, stages, none, none)
+        # Reads everything, so that no argument is optimised away.
+        total = cloud.points.sum() + frustum.sum() + sum(leaf.sum() for leaf in jax.tree.leaves(variables))
+        return Detections(boxes, jnp.zeros((1, 2)) * total, jnp.zeros((1, 2), jnp.int32), none, counts)
+
+    monkeypatch.setattr("ciassd_jax.inference.detector.predict", nothing)
+    detector = Detector(random_variables(small_config()), small_config())
+    monkeypatch.setattr("ciassd_jax.inference.detector.SMALLEST_BUCKET", 64)
+    for count in (1, 64, 63, 65, 256, 10, 257):
+        assert detector(np.zeros((count, 4), np.float32)).counts["points"]["given"] == count
+    assert traced == [(1, 64, 4), (1, 256, 4), (1, 1024, 4)]
+
+
+def test_repr_is_short_and_readable() -> None:
+    box = np.array([[10.0, -2.5, -0.9, 3.9, 1.6, 1.5, 0.1]], np.float32)
+    result = FrameResult(box.repeat(12, 0), np.linspace(0.9, 0.4, 12), ("Car",) * 12, {}, 0.1234)
+    lines = repr(result).splitlines()
+    assert lines[0] == "12 detections in 123 ms"
+    assert lines[1] == "  Car        0.90  at ( 10.00,  -2.50, -0.90)  3.90 x 1.60 x 1.50 m  yaw +0.10"
+    assert lines[-1] == "  ... and 2 more"
+    assert len(lines) == 12
+    assert max(map(len, lines)) <= 100
+
+
+def test_from_pretrained_reads_a_file(tmp_path: Path) -> None:
+    config = small_config()
+    save_weights(tmp_path / "w.safetensors", random_variables(config), config)
+    loaded = Detector.from_pretrained(tmp_path / "w.safetensors")
+    assert loaded.config == config
+
+
+def test_from_pretrained_says_which_names_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ciassd_jax.inference.weights.BUNDLED", tmp_path)
+    with pytest.raises(
+        InputError, match=r"'car_best' names no bundled weights \(none are bundled yet\); give the path"
+    ):
+        Detector.from_pretrained("car_best")
+    config = small_config()
+    save_weights(tmp_path / "small.safetensors", random_variables(config), config)
+    with pytest.raises(InputError, match="bundled are small"):
+        Detector.from_pretrained("car_best")
+    assert Detector.from_pretrained("small").config == config
+
+
+@pytest.mark.usefixtures("quiet")
+def test_a_result_draws_itself(detector: Detector) -> None:
+    result = detector(small_cloud())
+    figure = result.plot_bev(small_cloud())
+    assert f"detected ({len(result)})" in [t.get_text() for t in figure.axes[0].get_legend().get_texts()]

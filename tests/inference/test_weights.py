@@ -1,0 +1,225 @@
+"""Weights files: ours there and back, released ones in every layout, and what is refused."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import safetensors
+import safetensors.numpy
+from released import LAYOUTS, State, released_state, write_pth
+from small import random_variables, small_config
+
+from ciassd_jax import car_released
+from ciassd_jax.formats.errors import InputError
+from ciassd_jax.inference.weights import check_fits, load_released_weights, load_weights, save_weights
+
+
+def released_file(folder: Path, state: State) -> Path:
+    safetensors.numpy.save_file(state, folder / "released.safetensors")
+    return folder / "released.safetensors"
+
+
+def assert_same(a: Any, b: Any) -> None:
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def edit(path: Path, change: Any, **metadata: str) -> Path:
+    """Rewrite a file of ours after `change(tensors)`."""
+    with safetensors.safe_open(path, framework="numpy") as file:
+        before = file.metadata()
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    change(tensors)
+    safetensors.numpy.save_file(tensors, path, metadata=before | metadata)
+    return path
+
+
+@pytest.fixture
+def ours(tmp_path: Path) -> Path:
+    config = small_config()
+    save_weights(tmp_path / "ours.safetensors", random_variables(config), config)
+    return tmp_path / "ours.safetensors"
+
+
+def test_what_is_saved_is_loaded(ours: Path) -> None:
+    loaded = load_weights(ours)
+    assert loaded.config == small_config()
+    assert_same(loaded.variables, random_variables(small_config()))
+    assert {row.status for row in loaded.report} == {"mapped"}
+    assert list(ours.parent.iterdir()) == [ours]
+
+
+def test_half_kernels_are_rounded_and_nothing_else(tmp_path: Path) -> None:
+    config, variables = small_config(), random_variables(small_config())
+    save_weights(tmp_path / "half.safetensors", variables, config, half_kernels=True)
+
+    def rounded(keys: tuple, leaf: np.ndarray) -> np.ndarray:
+        return np.float32(np.float16(leaf)) if keys[-1].key == "kernel" else leaf
+
+    assert_same(
+        load_weights(tmp_path / "half.safetensors").variables, jax.tree_util.tree_map_with_path(rounded, variables)
+    )
+
+
+def test_a_kernel_beyond_float16_is_named(tmp_path: Path) -> None:
+    variables = jax.tree.map(lambda leaf: leaf * np.float32(1e6), random_variables(small_config()))
+    with pytest.raises(InputError, match=r"params/.*/kernel exceeds 65504"):
+        save_weights(tmp_path / "half.safetensors", variables, small_config(), half_kernels=True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_saved_metadata_names_the_classes(ours: Path) -> None:
+    with safetensors.safe_open(ours, framework="numpy") as file:
+        assert json.loads(file.metadata()["class_names"]) == ["Car"]
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/w\.safetensors cannot be written"):
+        save_weights(tmp_path / "file" / "w.safetensors", random_variables(small_config()), small_config())
+
+
+NAME = "params/head/box/kernel"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.pop(NAME), "head/box/kernel .* missing"),
+        (lambda t: t.update(extra=np.zeros(3, np.float32)), r"extra \(3,\): unexpected"),
+        (lambda t: t.update({NAME: t[NAME][..., :3]}), r"head/box/kernel .* shape differs, expected \(1, 1, 16, 14\)"),
+        (lambda t: t.update({NAME: t[NAME] * np.nan}), "head/box/kernel .* not finite"),
+    ],
+    ids=["missing", "unexpected", "shape", "not finite"],
+)
+def test_our_file_must_fit_exactly(ours: Path, change: Any, message: str) -> None:
+    with pytest.raises(InputError, match=f"does not fit its model in 1 of .*{message}.*; give the complete file"):
+        load_weights(edit(ours, change))
+
+
+def test_a_config_of_another_version_is_named(ours: Path) -> None:
+    config = json.loads(small_config().to_json()) | {"novelty": 1}
+    with pytest.raises(InputError, match=r"another version of the package: .*unknown \['novelty'\]"):
+        load_weights(edit(ours, lambda tensors: None, config=json.dumps(config)))
+
+
+@pytest.mark.parametrize("keep", [0, 7, 500, -1])
+def test_a_truncated_file_is_no_complete_one(ours: Path, keep: int) -> None:
+    ours.write_bytes(ours.read_bytes()[:keep])
+    with pytest.raises(InputError, match=r"ours\.safetensors is no complete safetensors file .*; fetch or write it"):
+        load_weights(ours)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    for name in ("none.safetensors", "none.pth"):
+        with pytest.raises(InputError, match=f"{re.escape(name)} .*check the path"):
+            load_weights(tmp_path / name)
+
+
+def test_check_fits_names_a_tensor_that_differs(ours: Path) -> None:
+    weights = load_weights(ours)
+    check_fits(weights, replace(small_config(), dtype="bfloat16"), ours)
+    with pytest.raises(InputError, match=r"holds weights for another config: .* leave out --preset"):
+        check_fits(weights, car_released(), ours)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_released_kernels_of_every_layout_give_the_same_variables(tmp_path: Path, layout: str) -> None:
+    state = released_state()
+    weights = load_released_weights(released_file(tmp_path, released_state(layout)))
+    assert weights.config == car_released()
+    params, statistics = weights.variables["params"], weights.variables["batch_stats"]
+    same = np.testing.assert_array_equal
+    same(params["backbone"]["stage0_0"]["kernel"], state["backbone.middle_conv.0.weight"])
+    same(params["backbone"]["stage3_down"]["kernel"], state["backbone.middle_conv.27.weight"])
+    same(params["backbone"]["out"]["kernel"], state["backbone.middle_conv.39.weight"])
+    same(statistics["backbone"]["stage1_0"]["norm"]["var"], state["backbone.middle_conv.10.running_var"])
+    same(params["neck"]["semantic_0"]["kernel"], state["neck.bottom_up_block_1.0.weight"].transpose(2, 3, 1, 0))
+    same(params["neck"]["upsample_to_spatial"]["kernel"], state["neck.deconv_block_0.0.weight"].transpose(2, 3, 0, 1))
+    same(params["neck"]["semantic_attention"]["norm"]["scale"], state["neck.w_1.1.weight"])
+    same(params["head"]["iou"]["kernel"], state["bbox_head.tasks.0.conv_iou.weight"].transpose(2, 3, 1, 0))
+    rows = {row.source: row for row in weights.report}
+    assert rows.keys() == state.keys()
+    assert rows["neck.w_0.0.weight"].status == "transposed"
+    assert rows["neck.w_0.1.num_batches_tracked"].status == "counter"
+
+
+@pytest.mark.parametrize("iou", [(3, False), (1, True)])
+def test_the_iou_head_is_that_of_the_file(tmp_path: Path, iou: tuple[int, bool]) -> None:
+    weights = load_released_weights(released_file(tmp_path, released_state(iou=iou)))
+    assert (weights.config.head.iou_kernel, weights.config.head.iou_bias) == iou
+    assert weights.variables["params"]["head"]["iou"]["kernel"].shape == (iou[0], iou[0], 128, 2)
+
+
+@pytest.mark.parametrize("legacy", [False, True], ids=["zip", "legacy"])
+@pytest.mark.parametrize("wrapped", [False, True], ids=["bare", "with optimizer"])
+def test_released_pth_of_both_formats(tmp_path: Path, legacy: bool, wrapped: bool) -> None:
+    state = {f"module.{name}": value for name, value in released_state(counters=False).items()}
+    content = {"state_dict": state, "optimizer": {"lr": 0.1}, "meta": {"epoch": 60}} if wrapped else state
+    loaded = load_weights(write_pth(tmp_path / "released.pth", content, legacy=legacy))
+    plain = load_released_weights(released_file(tmp_path, released_state()))
+    assert loaded.config == plain.config
+    assert_same(loaded.variables, plain.variables)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.pop("neck.w_0.0.weight"), "neck/spatial_attention/kernel .*: missing"),
+        (lambda s: s.update({"neck.w_9.weight": np.zeros(1, np.float32)}), r"neck\.w_9\.weight \(1,\): unexpected"),
+        (lambda s: s.pop("bbox_head.tasks.0.conv_iou.weight"), "head/iou/kernel .*: missing"),
+        (
+            lambda s: s.update({"neck.conv_0.0.weight": s["neck.conv_0.0.weight"][:, :64]}),
+            r"neck\.conv_0\.0\.weight \(128, 64, 3, 3\): shape differs, expected \(3, 3, 128, 128\)",
+        ),
+    ],
+    ids=["missing", "unexpected", "no iou head", "shape"],
+)
+def test_a_released_model_must_fit_exactly(tmp_path: Path, change: Any, message: str) -> None:
+    state = released_state()
+    change(state)
+    with pytest.raises(InputError, match=f"does not fit its model in 1 of .*{message}"):
+        load_released_weights(released_file(tmp_path, state))
+
+
+def test_mixed_layouts_are_refused(tmp_path: Path) -> None:
+    other = released_state("spconv 2")["backbone.middle_conv.0.weight"]
+    state = released_state() | {"backbone.middle_conv.0.weight": other}
+    with pytest.raises(InputError, match="sparse kernels of layouts"):
+        load_released_weights(released_file(tmp_path, state))
+
+
+def test_a_foreign_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is no released CIA-SSD model"):
+        load_weights(write_pth(tmp_path / "other.pth", {"state_dict": {"conv.weight": np.zeros(3, np.float32)}}))
+    with pytest.raises(InputError, match="holds no dictionary of tensors"):
+        load_weights(write_pth(tmp_path / "odd.pth", {"state_dict": [1, 2]}))
+
+
+def test_each_kind_of_file_has_its_own_door(tmp_path: Path, ours: Path) -> None:
+    path = released_file(tmp_path, released_state())
+    with pytest.raises(InputError, match=f"`ciassd convert {path} OUT.safetensors`"):
+        load_weights(path)
+    with pytest.raises(InputError, match="already a file of ours"):
+        load_released_weights(ours)
+
+
+@pytest.mark.reference
+def test_golden_weights_load_with_every_tensor_accounted_for(shared: Path) -> None:
+    weights = load_weights(shared / "golden" / "weights.pth")
+    assert weights.config == car_released()
+    assert len(weights.report) == 175
+    counts = {s: sum(row.status == s for row in weights.report) for s in ("mapped", "transposed", "counter")}
+    assert counts == {"mapped": 14 + 28 * 4 + 3, "transposed": 14 + 4, "counter": 28}
+    assert_same(weights.variables, load_released_weights(shared / "golden" / "weights.safetensors").variables)
+
+
+@pytest.mark.reference
+def test_a_part_of_the_golden_weights_is_refused(shared: Path) -> None:
+    with pytest.raises(InputError, match=r"weights_legacy_format_sample\.pth (does not fit|has sparse kernels)"):
+        load_weights(shared / "golden" / "weights_legacy_format_sample.pth")

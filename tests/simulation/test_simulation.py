@@ -1,0 +1,359 @@
+"""The LiDAR simulator: rays against known shapes, labels against what hides them, frames against their files."""
+
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ciassd_jax import tiny
+from ciassd_jax.data.folders import open_dataset
+from ciassd_jax.data.scenes import pad_frame
+from ciassd_jax.evaluation.dataset_check import check_dataset
+from ciassd_jax.formats.errors import InputError
+from ciassd_jax.formats.kitti import read_calibration, read_rows
+from ciassd_jax.ops.footprints import points_in_boxes
+from ciassd_jax.simulation import Lidar, frame_key, make_frame, open_synthetic, simulate, write_synthetic
+from ciassd_jax.simulation.casting import Hits, Rays, cast
+from ciassd_jax.simulation.ground import Ground, cast_ground, ground_height
+from ciassd_jax.simulation.label_rows import label_rows
+from ciassd_jax.simulation.layout import Objects, World, sample_world
+from ciassd_jax.simulation.materials import material
+from ciassd_jax.simulation.road_users import CAR, CYCLIST, NUM_STYLES, PEDESTRIAN, TRUCK, VAN, person, vehicle
+from ciassd_jax.simulation.sensor import scan
+from ciassd_jax.simulation.solids import Solids, block, column, cross, ellipsoid, extent, place, stack
+from ciassd_jax.simulation.streets import observe
+from ciassd_jax.simulation.virtual_camera import virtual_camera
+from ciassd_jax.types import Boxes
+
+# As many beams ahead as the real one has, and few columns.
+SMALL = Lidar(columns=512, noise=0.0, lost=0.0)
+WALL = material("wall")
+# One program for all that is tried: solids are filled up to so many.
+PADDED, PAIRS = 640, 2048
+build_person, build_vehicle = jax.jit(person), jax.jit(vehicle)
+cast_rays = jax.jit(cast, static_argnames="capacity")
+
+
+@cache
+def small_world(seed: int = 0) -> World:
+    return sample_world(jax.random.key(seed))
+
+
+def flat_ground() -> Ground:
+    zero, far = jnp.zeros(()), jnp.array(1e4)
+    return Ground(
+        sensor_height=jnp.array(1.73),
+        slope=jnp.zeros(2),
+        bend=zero,
+        yaw=zero,
+        middle=zero,
+        half_width=far,
+        crossing=far,
+        crossing_half=zero,
+        kerb=zero,
+        pavement=zero,
+        beyond=jnp.array(material("paving")),
+        shade=jnp.ones(()),
+        roughness=zero,
+    )
+
+
+def hits_of(solids: Solids, capacity: int = PAIRS) -> Hits:
+    missing = PADDED - len(solids.yaw)
+    padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, missing)] + [(0, 0)] * (leaf.ndim - 1)), solids)
+    rays = SMALL.rays()
+    return cast_rays(padded, jnp.zeros(PADDED), rays, jnp.zeros((rays.tangent.size, rays.azimuth.size)), capacity)
+
+
+def distances(solids: Solids) -> np.ndarray:
+    hits = hits_of(solids)
+    assert hits.dropped == 0
+    return np.asarray(hits.distance)
+
+
+def ahead(rays: Rays, elevation: float) -> tuple[int, int]:
+    """Row and column of the ray that looks along x, nearest to an elevation in degrees."""
+    assert rays.azimuth[rays.azimuth.size // 2] == 0
+    return int(np.argmin(abs(np.asarray(rays.tangent) - np.tan(np.deg2rad(elevation))))), rays.azimuth.size // 2
+
+
+def test_a_ray_meets_a_box_a_cylinder_and_an_ellipsoid_where_they_are() -> None:
+    row, column_ = ahead(SMALL.rays(), 0.0)
+    tangent = float(SMALL.rays().tangent[row])
+    for solid, expected in (
+        (block((12, 0.1, 0), (4, 2, 1.5), WALL), 10.0),
+        (column((12, 0, -1), 0.5, 3.0, WALL), 11.5),
+        (ellipsoid((12, 0, 12 * tangent), (0.8, 0.5, 0.5), WALL), 11.2),
+    ):
+        assert distances(stack([solid]))[row, column_] == pytest.approx(expected, abs=1e-3)
+
+
+def test_faces_lean() -> None:
+    row, column_ = ahead(SMALL.rays(), -3.0)
+    screen = block((12, 0, 0), (4, 2, 4), WALL, lean=(0.0, -0.5, 0.0, 0.0))
+    # The rear face is at x = 10 + 0.5 z.
+    tangent = float(SMALL.rays().tangent[row])
+    expected = 10 / (1 - 0.5 * tangent)
+    assert distances(stack([screen]))[row, column_] == pytest.approx(expected, abs=1e-3)
+
+
+def test_tiles_lose_nothing() -> None:
+    """Every ray tried with every solid of a street finds the same as the rays of the tiles alone."""
+    solids = jax.tree.map(lambda leaf: leaf[np.asarray(small_world().solids.present)], small_world().solids)
+    rays = SMALL.rays()
+    found = distances(solids)[:, ::8]
+
+    @jax.jit
+    def try_all(solids: Solids) -> jax.Array:
+        grown = jax.tree.map(lambda leaf: leaf[:, None, None], solids)
+        azimuth = rays.azimuth[None, None, ::8] - grown.yaw
+        tangent = jnp.broadcast_to(rays.tangent[None, :, None], (1, rays.tangent.size, 1))
+        enter, leave = cross(grown, (jnp.cos(azimuth), jnp.sin(azimuth), tangent))
+        enter = jnp.maximum(enter, 0.3)
+        return jnp.where(enter < leave, enter, jnp.inf).min(0)
+
+    expected = np.asarray(try_all(solids))
+    expected = np.where(expected < 100, expected, np.inf)
+    same = np.isclose(found, expected, atol=2e-3) | (np.isinf(found) & np.isinf(expected))
+    # Rays that graze an edge may go either way.
+    assert same.mean() > 0.9995
+    assert np.isfinite(expected).sum() > 500
+
+
+def test_what_is_over_capacity_is_counted() -> None:
+    walls = stack([block((10, 0, 0), (0.2, 30, 3), WALL), block((20, 0, 0), (0.2, 60, 3), WALL)])
+    few = hits_of(walls, 8)
+    assert few.dropped > 0
+    assert hits_of(walls).dropped == 0
+    # The nearer wall comes first.
+    assert set(np.unique(few.solid)) == {-1, 0}
+
+
+def test_flat_ground_is_met_at_the_sensor_height_over_the_tangent() -> None:
+    rays = SMALL.rays()
+    flat = jnp.zeros((rays.tangent.size, rays.azimuth.size))
+    distance, cosine, _ = cast_ground(flat_ground(), rays.azimuth, rays.tangent, flat)
+    down = np.asarray(rays.tangent) < 0
+    expected = np.broadcast_to(-1.73 / np.asarray(rays.tangent)[down, None], distance[down].shape)
+    np.testing.assert_allclose(distance[down], expected, rtol=1e-5)
+    assert np.isinf(distance[~down]).all()
+    np.testing.assert_allclose(cosine[down, 0], np.sin(-np.arctan(np.asarray(rays.tangent)[down])), atol=1e-6)
+
+
+def test_sloping_ground_with_kerbs_is_met_on_its_surface() -> None:
+    ground, rays = small_world().ground, SMALL.rays()
+    distance, _, _ = cast_ground(ground, rays.azimuth, rays.tangent, jnp.zeros((rays.tangent.size, 512)))
+    distance = jnp.where(distance < 60, distance, jnp.nan)
+    x, y = distance * jnp.cos(rays.azimuth)[None], distance * jnp.sin(rays.azimuth)[None]
+    above = np.asarray(distance * rays.tangent[:, None] - ground_height(ground, x, y))
+    above = above[np.isfinite(above)]
+    assert (abs(above) < 1e-3).mean() > 0.95
+    assert abs(above).max() < ground.kerb + 1e-3
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [
+        (CAR, (4.0, 1.65, 1.5)),
+        (VAN, (5.2, 1.9, 2.2)),
+        (TRUCK, (10.0, 2.6, 3.4)),
+        (PEDESTRIAN, (0.8, 0.6, 1.75)),
+        (CYCLIST, (1.8, 0.6, 1.75)),
+    ],
+)
+def test_objects_fill_their_boxes(kind: int, size: tuple[float, float, float]) -> None:
+    """Every solid stays within its object's box, and together they reach its faces, whatever the style."""
+    build = build_person if kind in (PEDESTRIAN, CYCLIST) else build_vehicle
+    length, width, height = size
+    for style in np.random.default_rng(0).uniform(size=(8, NUM_STYLES)).astype(np.float32):
+        solids = build(jnp.array(size), jnp.array(kind), jnp.array(style))
+        front, rear, side, high, low = extent(solids)
+        x, y, z = np.moveaxis(np.asarray(solids.origin), -1, 0)
+        real = np.asarray(solids.present)
+        edges = (x + front, -x + rear, abs(y) + side, z + high, -z + low)
+        reach = [float(np.max(np.asarray(edge)[real])) for edge in edges]
+        limits = (length / 2, length / 2, width / 2, height, 0.0)
+        assert all(found < limit + 0.1 for found, limit in zip(reach, limits, strict=True)), reach
+        assert all(found > limit - 0.16 for found, limit in zip(reach, limits, strict=True)), reach
+
+
+def test_points_of_objects_lie_in_their_boxes() -> None:
+    world = small_world()
+    _, sight = scan(jax.random.key(1), world, SMALL)
+    rays, owner = SMALL.rays(), np.asarray(sight.owner)
+    flat = np.asarray(sight.range / jnp.sqrt(1 + rays.tangent**2)[:, None])
+    flat = np.where(np.isfinite(flat), flat, 0)
+    x, y = flat * np.cos(rays.azimuth)[None], flat * np.sin(rays.azimuth)[None]
+    places = np.stack([x, y, flat * np.asarray(rays.tangent)[:, None]], -1)
+    seen = np.unique(owner[owner >= 0])
+    assert len(seen) >= 3
+    for index in seen:
+        box = jax.tree.map(
+            lambda leaf, index=index: np.asarray(leaf)[None, index].astype(np.float64), world.objects.boxes
+        )
+        inside = points_in_boxes(places[owner == index].astype(np.float64), box._replace(size=box.size + 0.1))
+        assert inside.mean() > 0.99
+
+
+def street_with(more: Solids) -> World:
+    """A car 15 m ahead on flat ground, and something else."""
+    size = jnp.array([4.0, 1.7, 1.5])
+    style = jnp.full(NUM_STYLES, 0.5)
+    car = place(vehicle(size, jnp.array(CAR), style), jnp.array([15.0, 0.0, -1.73]), jnp.zeros(()))
+    car = car._replace(owner=jnp.zeros_like(car.owner))
+    boxes = Boxes(jnp.array([[15.0, 0.0, -0.98]]), size[None], jnp.zeros(1))
+    solids = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), car, stack([more]))
+    return World(flat_ground(), solids, Objects(boxes, jnp.array([CAR]), jnp.array([True])))
+
+
+def labels_of(world: World) -> list:
+    seen = jax.device_get(observe(jax.random.key(0), world, SMALL))
+    boxes = jax.tree.map(lambda leaf: leaf.astype(np.float64), seen.objects.boxes)
+    return label_rows(boxes, seen.objects.kind, seen.through, seen.arriving, virtual_camera())
+
+
+def test_a_car_in_the_open_is_labelled_as_visible() -> None:
+    (row,) = labels_of(street_with(block((7, 9, -0.5), (0.2, 6, 3), WALL)))
+    assert (row.type, row.occluded, row.truncated) == ("Car", 0, 0)
+    x1, _, x2, _ = row.bbox
+    assert 550 < (x1 + x2) / 2 < 650
+    assert row.rotation_y == pytest.approx(-np.pi / 2)
+
+
+@pytest.mark.parametrize(("edge", "occlusion"), [(0.1, 1), (-0.2, 2)])
+def test_a_wall_hides_part_of_a_car(edge: float, occlusion: int) -> None:
+    """From the left up to y = edge at 7 m, where the car is seen from -0.46 to 0.46: 39 % and 72 % of it."""
+    (row,) = labels_of(street_with(block((7, edge + 3, -0.5), (0.2, 6, 3), WALL)))
+    assert row.occluded == occlusion
+
+
+def test_a_wall_hides_a_car_and_its_label() -> None:
+    assert labels_of(street_with(block((7, 0, -0.5), (0.2, 8, 3), WALL))) == []
+
+
+def test_labels_at_the_edge_of_the_image_are_truncated() -> None:
+    box = Boxes(np.array([[10.0, 8.0, -1.0]]), np.array([[4.0, 1.7, 1.5]]), np.zeros(1))
+    (row,) = label_rows(box, np.array([CAR]), np.array([100]), np.array([100]), virtual_camera())
+    assert row.bbox[0] == 0
+    assert 0.1 < row.truncated < 0.9
+
+
+def test_few_rays_make_no_label_but_a_region_not_to_care_about() -> None:
+    box = Boxes(np.array([[60.0, 0.0, -1.0]]), np.array([[4.0, 1.7, 1.5]]), np.zeros(1))
+    (row,) = label_rows(box, np.array([CAR]), np.array([2]), np.array([2]), virtual_camera())
+    assert (row.type, row.truncated, row.occluded, row.location) == ("DontCare", -1, -1, (-1000, -1000, -1000))
+    assert row.bbox[2] > row.bbox[0]
+
+
+def test_objects_stand_apart_on_the_ground() -> None:
+    for seed in range(3):
+        world = small_world(seed)
+        present = np.asarray(world.objects.present)
+        boxes = jax.tree.map(lambda leaf, present=present: np.asarray(leaf)[present], world.objects.boxes)
+        center, bottom = boxes.center, boxes.center[:, 2] - boxes.size[:, 2] / 2
+        np.testing.assert_allclose(bottom, ground_height(world.ground, center[:, 0], center[:, 1]), atol=1e-4)
+        grown = boxes._replace(size=boxes.size * np.array([[1, 1, 99]], np.float32))
+        inside = points_in_boxes(np.asarray(center), grown)
+        assert (inside.sum(1) == 1).all()
+        assert not points_in_boxes(np.zeros((1, 3), np.float32), grown).any()
+
+
+def test_a_frame_depends_on_its_seed_and_index_alone() -> None:
+    first, again, other = make_frame(3, 5, SMALL), make_frame(3, 5, SMALL), make_frame(3, 6, SMALL)
+    np.testing.assert_array_equal(first.points, again.points)
+    assert first.rows == again.rows
+    assert len(first.points) != len(other.points)
+
+
+def test_a_cloud_is_what_a_lidar_gives() -> None:
+    points = make_frame(0, 0, SMALL).points
+    rays = 64 * SMALL.columns
+    assert 0.5 * rays < len(points) < rays
+    assert np.isfinite(points).all()
+    assert points[:, 3].min() >= 0
+    assert points[:, 3].max() <= 1
+    distance = np.linalg.norm(points[:, :3], axis=1)
+    assert distance.max() < SMALL.max_range + 0.1
+    # The roof of the car that carries the sensor shades what lies close before and behind it.
+    flat = np.hypot(points[:, 0], points[:, 1])
+    assert flat[(points[:, 0] > 0) & (abs(points[:, 1]) < 0.3)].min() > 4.4
+
+
+def test_scenes_can_be_batched() -> None:
+    keys = jnp.stack([frame_key(0, index) for index in range(2)])
+    batch = jax.eval_shape(jax.vmap(lambda key: simulate(key, SMALL)), keys)
+    assert batch.cloud.points.shape == (2, 64 * SMALL.columns, 4)
+    assert batch.dropped.shape == (2,)
+
+
+def test_a_folder_gives_back_the_frames(tmp_path: Path) -> None:
+    assert write_synthetic(tmp_path / "five", frames=5, seed=1, lidar=SMALL) == 0
+    files, direct = open_dataset(tmp_path / "five", "trainval"), open_synthetic(1, 5, SMALL)
+    assert files.names == direct.names == ("000000", "000001", "000002", "000003", "000004")
+    assert open_dataset(tmp_path / "five", "val").names == ("000003",)
+    assert open_dataset(tmp_path / "five", "train").names == ("000000", "000001", "000002", "000004")
+    for index in range(5):
+        read, made = files.read(index), direct.read(index)
+        np.testing.assert_array_equal(read.points, made.points)
+        assert (read.names, read.difficulty.tolist()) == (made.names, made.difficulty.tolist())
+        np.testing.assert_allclose(read.boxes.to_array(), made.boxes.to_array(), atol=1e-3)
+    assert pad_frame(direct.read(0), 0, tiny()).truth.count == len(direct.read(0).names)
+    report = check_dataset(tmp_path / "five")
+    assert [finding.text for finding in report.findings if finding.serious] == []
+    assert len(report.frames) == 5
+    # A shorter folder holds the same frames.
+    write_synthetic(tmp_path / "two", frames=2, seed=1, lidar=SMALL)
+    for file in ("velodyne/000001.bin", "label_2/000001.txt", "image_2/000001.png", "calib/000001.txt"):
+        assert (tmp_path / "two/training" / file).read_bytes() == (tmp_path / "five/training" / file).read_bytes()
+
+
+def test_labels_give_back_the_boxes_of_the_world() -> None:
+    """The box that the reader finds is the one that the rays hit, in place and heading."""
+    seen = jax.device_get(simulate(frame_key(1, 0), SMALL))
+    frame = open_synthetic(1, 1, SMALL).read(0)
+    centers = seen.objects.boxes.center[seen.objects.present]
+    yaws = seen.objects.boxes.yaw[seen.objects.present]
+    assert len(frame.names) > 0
+    for center, yaw in zip(frame.boxes.center, frame.boxes.yaw, strict=True):
+        nearest = np.argmin(np.linalg.norm(centers - center, axis=1))
+        np.testing.assert_allclose(center, centers[nearest], atol=1e-3)
+        assert np.cos(yaw - yaws[nearest]) > 1 - 1e-6
+
+
+def test_the_virtual_camera_is_that_of_its_file(tmp_path: Path) -> None:
+    write_synthetic(tmp_path, frames=1, seed=0, lidar=SMALL)
+    read = read_calibration(tmp_path / "training/calib/000000.txt")
+    for mine, theirs in zip(virtual_camera().calibration, read, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    for row in read_rows(tmp_path / "training/label_2/000000.txt"):
+        assert row.type == "DontCare" or (abs(row.rotation_y) <= np.pi and abs(row.alpha) <= np.pi)
+
+
+def test_a_folder_that_is_not_its_own_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(InputError, match=r"is not empty; name another folder, or replace .* with --overwrite"):
+        write_synthetic(tmp_path, frames=1, seed=0, lidar=SMALL)
+    with pytest.raises(InputError, match="was not written by `ciassd data synth`, so it stays"):
+        write_synthetic(tmp_path, frames=1, seed=0, lidar=SMALL, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_overwriting_leaves_no_old_frame(tmp_path: Path) -> None:
+    write_synthetic(tmp_path, frames=3, seed=0, lidar=SMALL)
+    write_synthetic(tmp_path, frames=1, seed=0, lidar=SMALL, overwrite=True)
+    assert open_dataset(tmp_path, "all").names == ("000000",)
+
+
+def test_pillow_is_asked_for_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "PIL.Image", None)
+    with pytest.raises(InputError, match=r"get it with `pip install 'ciassd_jax\[viz\]'`"):
+        write_synthetic(tmp_path / "out", frames=1, seed=0, lidar=SMALL)
+    assert not (tmp_path / "out").exists()
+
+
+def test_numbers_of_rays_that_are_no_whole_tiles_are_refused() -> None:
+    with pytest.raises(ValueError, match="multiples of 16"):
+        Lidar(columns=100)

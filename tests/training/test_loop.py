@@ -1,0 +1,287 @@
+"""The training loop: what it leaves in its folder, and that a run that was cut off ends with the same bits."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from mini_training import (
+    STEPS,
+    compile_quickly,
+    mini_batches,
+    mini_config,
+    mini_fit,
+    share_training_programs,
+    write_data,
+)
+from small import random_variables
+
+from ciassd_jax import create_train_state, load_weights, open_dataset
+from ciassd_jax.data.folders import find_database
+from ciassd_jax.data.workers import WorkerError
+from ciassd_jax.formats.errors import InputError
+from ciassd_jax.model.network import variables_of
+from ciassd_jax.training import loop
+from ciassd_jax.training.checkpoint import Checkpoints
+from ciassd_jax.training.loop import Fitted, Intervals, TrainingError, fit
+from ciassd_jax.training.metrics import MetricsLog
+from ciassd_jax.training.signals import signals_noted
+from ciassd_jax.types import TrainState
+
+
+@pytest.fixture(autouse=True)
+def _compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    share_training_programs(monkeypatch)
+
+
+@pytest.fixture(autouse=True)
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C as at a terminal: in the background of a shell it is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def whole(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Fitted, Path, list[str]]:
+    """A run that nothing cut off, its folder and what it said."""
+    workdir, said = tmp_path_factory.mktemp("whole") / "new", []
+    validation = open_dataset(root, "val")
+    with pytest.MonkeyPatch.context() as patch:
+        # The program of the other runs, but compiled here, so that this is said.
+        patch.setattr(loop._Run, "_compile", compile_quickly)
+        return mini_fit(root, workdir, said.append, validation=validation), workdir, said
+
+
+def assert_same_bits(some: TrainState, others: TrainState) -> None:
+    assert jax.tree.structure(some) == jax.tree.structure(others)
+    jax.tree.map(np.testing.assert_array_equal, some, others)
+
+
+def lines(workdir: Path) -> list[dict[str, Any]]:
+    """The lines of the record without its times and evaluations."""
+    found = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
+    return [{name: value for name, value in line.items() if name != "seconds"} for line in found if "loss" in line]
+
+
+def saved_state(workdir: Path) -> TrainState:
+    like = create_train_state(jax.random.key(0), mini_config(), variables=random_variables(mini_config()))
+    with Checkpoints(workdir / "checkpoints", mini_config()) as checkpoints:
+        restored = checkpoints.restore(like)
+    assert restored is not None
+    assert restored.loader.batch == restored.state.step
+    return restored.state
+
+
+def test_the_folder_has_everything(whole: tuple[Fitted, Path, list[str]]) -> None:
+    fitted, workdir, said = whole
+    assert int(fitted.state.step) == STEPS
+    assert fitted.stopped is None
+    names = {path.name for path in workdir.iterdir()}
+    assert names == {
+        *("config.json", "versions.json", "metrics.jsonl", "checkpoints", "eval"),
+        *("best.safetensors", "last.safetensors"),
+    }
+    assert (workdir / "config.json").read_text().strip() == mini_config().to_json()
+    assert json.loads((workdir / "versions.json").read_text())["seed"] == 3
+    # Three frames in batches of two: epoch 4 ends with step 6.
+    assert sorted(path.name for path in (workdir / "eval").iterdir()) == ["6", "9"]
+    assert {path.name for path in (workdir / "eval" / "9").iterdir()} == {"data", "result.json", "table.txt"}
+    assert (workdir / "eval" / "9" / "data" / "000000.txt").is_file()
+    assert {"8", "9"} <= {path.name for path in (workdir / "checkpoints").iterdir()}
+    assert sum(text.startswith("Compiled the step of 2 scenes for 2 cpu devices in ") for text in said) == 1
+    assert sum("tensorboardX" in text for text in said) == 1
+
+
+def test_the_record_has_every_step_and_scores(whole: tuple[Fitted, Path, list[str]]) -> None:
+    fitted, workdir, _ = whole
+    assert [line["step"] for line in lines(workdir)] == list(range(1, STEPS + 1))
+    assert lines(workdir)[2]["epoch"] == 2
+    every = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
+    scores = {line["step"]: line for line in every if "score" in line}
+    assert set(scores) == {6, 9}
+    assert scores[9]["score"] == scores[9]["Car_3d_0.70_moderate_R40"]
+    assert "Car_bev_0.50_moderate_R40" in scores[9]
+    assert fitted.best == max(line["score"] for line in scores.values())
+
+
+def test_the_weights_are_those_of_the_last_step(whole: tuple[Fitted, Path, list[str]]) -> None:
+    fitted, workdir, _ = whole
+    weights = load_weights(workdir / "last.safetensors")
+    assert weights.config == mini_config()
+    # The running mean, as this config has one.
+    jax.tree.map(np.testing.assert_array_equal, weights.variables, variables_of(fitted.state))
+    assert_same_bits(saved_state(workdir), fitted.state)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_stopped_run_goes_on_with_the_same_bits(
+    number: int, whole: tuple[Fitted, Path, list[str]], root: Path, tmp_path: Path
+) -> None:
+    handlers = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+
+    def stop(text: str) -> None:
+        if text.startswith("step 3/"):
+            signal.raise_signal(number)
+
+    stopped = mini_fit(root, tmp_path, stop)
+    assert (int(stopped.state.step), stopped.stopped) == (3, number)
+    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == handlers
+    said: list[str] = []
+    resumed = mini_fit(root, tmp_path, said.append)
+    assert said[0].startswith("Going on from step 3 in ")
+    assert_same_bits(resumed.state, whole[0].state)
+    assert lines(tmp_path) == lines(whole[1])
+    # There is nothing left to do.
+    assert_same_bits(mini_fit(root, tmp_path).state, whole[0].state)
+
+
+def test_a_killed_run_goes_on_with_the_same_bits(
+    whole: tuple[Fitted, Path, list[str]], root: Path, tmp_path: Path
+) -> None:
+    program = Path(__file__).with_name("mini_training.py")
+    process = subprocess.Popen([sys.executable, str(program), str(root), str(tmp_path)], stderr=subprocess.PIPE)
+    checkpoints, deadline = tmp_path / "checkpoints", time.monotonic() + 300
+    # The next checkpoint may be half-written when the first is complete.
+    while process.poll() is None and time.monotonic() < deadline:
+        if checkpoints.is_dir() and any(path.name.isdigit() for path in checkpoints.iterdir()):
+            break
+        time.sleep(0.001)
+    process.kill()
+    _, errors = process.communicate()
+    assert process.returncode == -signal.SIGKILL, errors.decode()
+    said: list[str] = []
+    resumed = mini_fit(root, tmp_path, said.append)
+    assert said[0].startswith("Going on from step "), said
+    assert_same_bits(resumed.state, whole[0].state)
+    assert lines(tmp_path) == lines(whole[1])
+
+
+def test_a_label_that_is_none_is_named_and_the_rest_is_saved(root: Path, tmp_path: Path) -> None:
+    dataset, config = open_dataset(root, "train"), mini_config()
+    batches = mini_batches(root, config)
+    taken = []
+
+    def read(name: str) -> Any:
+        frame = dataset.read_frame(name)
+        taken.append(name)
+        if len(taken) > 10:
+            frame.boxes.size[0] = np.nan
+        return frame
+
+    object.__setattr__(batches._rows.stream, "dataset", type(dataset)(dataset.names, read, dataset.find_files))
+    with pytest.raises(InputError, match=r"Frame 00000\d: object 0 \(Car\) has the size nan"):
+        mini_fit(root, tmp_path, batches=batches)
+    assert int(saved_state(tmp_path).step) == len(lines(tmp_path)) >= 1
+
+
+def test_a_dead_worker_loses_no_step(
+    whole: tuple[Fitted, Path, list[str]], root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batches = mini_batches(root, mini_config())
+    after = type(batches).__next__
+
+    def die(self: Any) -> Any:
+        if self.state.batch == 5:
+            raise WorkerError("A worker of the loader died.")
+        return after(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(batches), "__next__", die)
+        with pytest.raises(WorkerError):
+            mini_fit(root, tmp_path, batches=batches)
+    assert int(saved_state(tmp_path).step) == 5
+    assert_same_bits(mini_fit(root, tmp_path).state, whole[0].state)
+
+
+def test_losses_that_stay_not_finite_end_it(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitting, "_HOPELESS", 4)
+    broken = jax.tree.map(lambda leaf: leaf * np.float32(np.nan), random_variables(mini_config()))
+    with pytest.raises(TrainingError, match="last 4 updates were not finite"):
+        mini_fit(root, tmp_path, variables=broken, intervals=Intervals(log=4))
+    assert lines(tmp_path)[-1]["loss"] is None
+
+
+def test_another_stream_is_refused(whole: tuple[Fitted, Path, list[str]], root: Path) -> None:
+    batches = mini_batches(root, mini_config(), seed=4)
+    with pytest.raises(InputError, match=r"is of another training: .*seed 3 instead of 4"):
+        fit(mini_config(), batches, whole[1])
+    assert len(lines(whole[1])) == STEPS
+
+
+def test_lines_after_the_step_and_cut_ones_go(tmp_path: Path) -> None:
+    written = "".join(f'{{"step": {step}, "score": {step}.5}}\n' for step in (2, 4, 6))
+    (tmp_path / "metrics.jsonl").write_text(f'{written}{{"step": 8, "sco')
+    log = MetricsLog(tmp_path, 4, lambda text: None)
+    log.write(6, {"loss": float("inf")})
+    log.close()
+    assert [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()] == [
+        {"step": 2, "score": 2.5},
+        {"step": 4, "score": 4.5},
+        {"step": 6, "loss": None},
+    ]
+
+
+def test_events_go_to_tensorboard_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple] = []
+
+    class Writer:
+        def __init__(self, folder: str, purge_step: int) -> None:
+            calls.append((folder, purge_step))
+
+        def add_scalar(self, *number: object) -> None:
+            calls.append(number)
+
+        def close(self) -> None:
+            calls.append(())
+
+    monkeypatch.setitem(sys.modules, "tensorboardX", types.SimpleNamespace(SummaryWriter=Writer))
+    log = MetricsLog(tmp_path, 4, calls.append)  # type: ignore[arg-type]
+    log.write(5, {"loss": 2.0})
+    log.close()
+    assert calls == [(str(tmp_path / "tb"), 5), ("loss", 2.0, 5), ()]
+
+
+def test_the_database_is_found_or_built(root: Path, tmp_path: Path) -> None:
+    dataset, said = open_dataset(root, "train"), []
+    stale = tmp_path / "stale.bin"
+    stale.write_bytes(b"no database")
+    built = find_database(dataset, [stale, tmp_path / "built.bin"], say=said.append)
+    assert (built.path, len(said)) == (tmp_path / "built.bin", 1)
+    again = find_database(dataset, [stale, tmp_path / "built.bin"], say=said.append)
+    assert (again.path, len(said)) == (tmp_path / "built.bin", 1)
+    assert stale.read_bytes() == b"no database"
+
+
+def test_intervals_that_are_none_are_refused() -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        Intervals(save=0)
+
+
+def test_a_second_signal_acts_as_ever() -> None:
+    with signals_noted() as noted:
+        signal.raise_signal(signal.SIGINT)
+        assert noted == [signal.SIGINT]
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_an_ignored_signal_stays_ignored() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with signals_noted() as noted:
+        signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    assert noted == []
