@@ -75,9 +75,10 @@ def count_voxels(scene: Scene, config: Config) -> float:
 def scaled(config: Config, share: float) -> Config:
     """The config with a share of every capacity of sites."""
     backbone = config.backbone
-    stages = tuple(replace(stage, capacity=int(share * stage.capacity)) for stage in backbone.stages)
+    first, *others = backbone.stages
+    stages = (first, *(replace(stage, capacity=int(share * (stage.capacity or 0))) for stage in others))
     backbone = replace(backbone, stages=stages, out_capacity=int(share * backbone.out_capacity))
-    return replace(config, grid=replace(config.grid, max_voxels=stages[0].capacity), backbone=backbone)
+    return replace(config, grid=replace(config.grid, max_voxels=int(share * config.grid.max_voxels)), backbone=backbone)
 
 
 class OurStep:

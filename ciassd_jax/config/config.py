@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+import jax
 
 from ciassd_jax.config.json import rebuild
 from ciassd_jax.config.model import (
@@ -41,11 +43,6 @@ class Config:
             raise ValueError("classes: at least one is needed, each with its own name.")
         if self.dtype not in ("float32", "bfloat16", "float64"):
             raise ValueError(f"dtype: {self.dtype!r} is unknown; choose 'float32', 'bfloat16' or 'float64'.")
-        if self.backbone.stages[0].capacity != self.grid.max_voxels:
-            raise ValueError(
-                f"backbone: the first stage holds {self.backbone.stages[0].capacity} sites but the grid "
-                f"{self.grid.max_voxels} voxels; the two must be equal."
-            )
         multiple = 2 * self.backbone.stride
         for axis, cells in zip("xy", self.grid.cells, strict=False):
             if cells % multiple:
@@ -88,9 +85,42 @@ class Config:
 
     @classmethod
     def from_json(cls, text: str) -> Config:
-        """Read `to_json`'s text; unknown or missing fields and wrong types are a ValueError that names them."""
+        """Read `to_json`'s text, or that of an earlier version.
+
+        A missing field takes its default. Raises ValueError, one sentence that names the field, for an unknown field
+        and for a wrong type.
+        """
         try:
             data = json.loads(text)
         except json.JSONDecodeError as error:
             raise ValueError(f"The config is no valid JSON ({error}).") from error
-        return rebuild(cls, data, "config")
+        return rebuild(cls, _without_first_capacity(data), "config")
+
+    def for_inference(self) -> Config:
+        """The config with every field that `predict` does not read at its default.
+
+        Configs that differ in training alone become equal, so that a program compiled for one serves the others.
+        """
+        unread = {name: getattr(_UNREAD_CLASS, name) for name in _UNREAD_CLASS_FIELDS}
+        classes = tuple(replace(one, **unread) for one in self.classes)
+        return replace(self, classes=classes, loss=LossConfig(), data=DataConfig(), schedule=ScheduleConfig())
+
+
+# Leaves no array behind: `jax.jit` takes a config as an argument without `static_argnames`.
+jax.tree_util.register_static(Config)
+
+# What only matching, sampling and evaluation read of a class.
+_UNREAD_CLASS_FIELDS = ("matched", "unmatched", "similar", "gt_sampling_up_to", "gt_sampling_min_points")
+_UNREAD_CLASS = ClassConfig()
+
+
+def _without_first_capacity(data: Any) -> Any:
+    """Parsed JSON without the first stage's capacity, which earlier versions wrote as a copy of `grid.max_voxels`."""
+    try:
+        first, max_voxels = data["backbone"]["stages"][0], data["grid"]["max_voxels"]
+        if first["capacity"] != max_voxels:
+            return data
+    except (KeyError, IndexError, TypeError):
+        return data
+    stages = [{name: value for name, value in first.items() if name != "capacity"}, *data["backbone"]["stages"][1:]]
+    return data | {"backbone": data["backbone"] | {"stages": stages}}

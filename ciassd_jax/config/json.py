@@ -1,26 +1,40 @@
-"""Dataclasses from parsed JSON, checked against their annotations."""
+"""Configs as JSON: checked against the annotations of the dataclasses, with the field names of earlier versions."""
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import types
 import typing
+from collections.abc import Iterable
 from typing import Any, Literal
+
+# Fields that had another name in files of earlier versions, by section: old name to new name.
+RENAMED = {
+    "AugmentationConfig": {"paste": "gt_sampling"},
+    "DataConfig": {"max_paste_points": "max_gt_sampling_points"},
+    "ClassConfig": {"paste_up_to": "gt_sampling_up_to", "paste_min_points": "gt_sampling_min_points"},
+    "DetectionConfig": {"nms_overlap": "nms_iou_threshold"},
+    "ScheduleConfig": {
+        "accumulate": "gradient_accumulation_steps",
+        "rematerialize": "remat",
+        "momentum": "b1_range",
+        "second_moment": "b2",
+        "start_divisor": "div_factor",
+        "end_divisor": "final_div_factor",
+    },
+}
 
 
 def rebuild(kind: Any, data: Any, where: str) -> Any:
-    """A value of the annotated type from parsed JSON; ValueError names the field that is not as annotated."""
+    """Build a value of the annotated type from parsed JSON.
+
+    A missing field takes its default, and a field may have the name of an earlier version. Raises ValueError, one
+    sentence that names the field, for an unknown field and for a value that is not as annotated.
+    """
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        names = {f.name for f in dataclasses.fields(kind)}
-        if not isinstance(data, dict) or set(data) != names:
-            given = set(data) if isinstance(data, dict) else set()
-            raise ValueError(
-                f"{where}: expected the fields {sorted(names)}; unknown {sorted(given - names)}, "
-                f"missing {sorted(names - given)}."
-            )
-        hints = typing.get_type_hints(kind)
-        return kind(**{name: rebuild(hints[name], data[name], f"{where}.{name}") for name in data})
+        return _rebuild_dataclass(kind, data, where)
     if origin is tuple:
         if not isinstance(data, list):
             raise ValueError(f"{where}: expected a list, not {data!r}.")
@@ -35,8 +49,35 @@ def rebuild(kind: Any, data: Any, where: str) -> Any:
         return data
     if kind is float and isinstance(data, int) and not isinstance(data, bool):
         return float(data)
-    if origin is types.UnionType and any(isinstance(data, a) for a in arguments):
-        return data
+    if origin is types.UnionType:
+        if data is None and type(None) in arguments:
+            return None
+        return rebuild(next(one for one in arguments if one is not type(None)), data, where)
     if type(data) is not kind:
         raise ValueError(f"{where}: expected {kind.__name__}, not {data!r}.")
     return data
+
+
+def _rebuild_dataclass(kind: Any, data: Any, where: str) -> Any:
+    hints = typing.get_type_hints(kind)
+    if not isinstance(data, dict):
+        raise ValueError(f"{where}: expected the fields {sorted(hints)}, not {data!r}.")
+    renamed = RENAMED.get(kind.__name__, {})
+    values = {}
+    for given, value in data.items():
+        name = renamed.get(given, given)
+        if name not in hints:
+            raise ValueError(f"{where}: the field '{given}' is unknown; {_nearest(given, hints)}.")
+        if name in values:
+            raise ValueError(f"{where}: '{given}' is the old name of '{name}'; remove one of the two.")
+        values[name] = rebuild(hints[name], value, f"{where}.{given}")
+    required = [f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING]
+    if missing := [name for name in required if name not in values]:
+        raise ValueError(f"{where}: the field '{missing[0]}' is missing and has no default; add it.")
+    return kind(**values)
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    """The known name most like a name, or all known names."""
+    close = difflib.get_close_matches(name, known, 1)
+    return f"did you mean '{close[0]}'" if close else f"known are {', '.join(sorted(known))}"

@@ -65,15 +65,19 @@ class GridConfig:
 
 @dataclass(frozen=True)
 class StageConfig:
-    """One resolution of the backbone: a strided convolution into it (none for the first), then submanifold ones."""
+    """One resolution of the backbone: a strided convolution into it (none for the first), then submanifold ones.
+
+    `capacity` is the number of site slots. The first stage has none: its sites are the voxels, `grid.max_voxels`.
+    """
 
     channels: int
     layers: int
-    capacity: int
+    capacity: int | None = None
     z_padding: int = 1
 
     def __post_init__(self) -> None:
-        if self.channels < 1 or self.layers < 0 or self.capacity < 1 or self.z_padding not in (0, 1):
+        slots = 1 if self.capacity is None else self.capacity
+        if self.channels < 1 or self.layers < 0 or slots < 1 or self.z_padding not in (0, 1):
             raise ValueError(
                 f"backbone stage {self}: channels and capacity must be at least 1, layers at least 0, z_padding 0 or 1."
             )
@@ -81,10 +85,10 @@ class StageConfig:
 
 @dataclass(frozen=True)
 class BackboneConfig:
-    """SPConvNet (paper section 3.1, SPEC section 4). The first stage's capacity is the grid's `max_voxels`."""
+    """SPConvNet, the sparse 3D encoder (paper section 3.1)."""
 
     stages: tuple[StageConfig, ...] = (
-        StageConfig(channels=16, layers=2, capacity=20000),
+        StageConfig(channels=16, layers=2),
         StageConfig(channels=32, layers=2, capacity=48000),
         StageConfig(channels=64, layers=3, capacity=36000),
         StageConfig(channels=64, layers=3, capacity=18000, z_padding=0),
@@ -97,6 +101,16 @@ class BackboneConfig:
     def __post_init__(self) -> None:
         if not self.stages:
             raise ValueError("backbone: at least one stage is needed.")
+        first, *others = (stage.capacity for stage in self.stages)
+        if first is not None:
+            raise ValueError(
+                f"backbone.stages[0].capacity: the first stage has no capacity of its own; remove the {first} and set "
+                "grid.max_voxels."
+            )
+        if None in others:
+            raise ValueError(
+                f"backbone.stages[{1 + others.index(None)}].capacity is missing; only the first stage has none."
+            )
         if self.backend not in ("gather", "dense"):
             raise ValueError(f"backbone: backend {self.backend!r} is unknown; choose 'gather' or 'dense'.")
 
@@ -109,6 +123,10 @@ class BackboneConfig:
         depth, height, width = shapes[-1]
         shapes.append(((depth - 3) // 2 + 1, height, width))
         return tuple(shapes)
+
+    def capacities(self, max_voxels: int) -> tuple[int, ...]:
+        """Site slots of every stage and of the output."""
+        return (max_voxels, *(stage.capacity or 0 for stage in self.stages[1:]), self.out_capacity)
 
     @property
     def stride(self) -> int:

@@ -50,7 +50,7 @@ def car_lite() -> Config:
         grid=GridConfig(voxel_size=(0.1, 0.1, 0.2), max_voxels=14000),
         backbone=BackboneConfig(
             stages=(
-                StageConfig(channels=8, layers=1, capacity=14000),
+                StageConfig(channels=8, layers=1),
                 StageConfig(channels=16, layers=0, capacity=18000),
                 StageConfig(channels=32, layers=1, capacity=12000),
                 StageConfig(channels=32, layers=2, capacity=5000),
@@ -86,7 +86,7 @@ def tiny() -> Config:
         ),
         backbone=BackboneConfig(
             stages=(
-                StageConfig(channels=4, layers=1, capacity=2048),
+                StageConfig(channels=4, layers=1),
                 StageConfig(channels=8, layers=1, capacity=2048),
                 StageConfig(channels=8, layers=1, capacity=1024),
             ),

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int
@@ -23,6 +23,7 @@ class Frame(NamedTuple):
     `points` (x, y, z, intensity) are finite and, where there is a camera, those that it sees. `boxes` are float64,
     `names` the types of the objects in the order of the label file without DontCare. `difficulty` is 0 (easy), 1,
     2 (hard) or -1 (none of them): KITTI's of the label with a camera (SPEC 1.4), without one `difficulty_by_points`.
+    `rows` are the rows of the label file as read, DontCare among them.
     """
 
     name: str
@@ -31,6 +32,7 @@ class Frame(NamedTuple):
     names: tuple[str, ...]
     difficulty: Int[np.ndarray, " G"]
     camera: Camera | None
+    rows: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True)

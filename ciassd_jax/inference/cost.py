@@ -41,8 +41,8 @@ def count_flops(config: Config) -> dict[str, int]:
 def _positions(part: str, layer: str, config: Config, cells: int) -> int:
     """How often a layer's kernel is applied."""
     if part == "backbone":
-        backbone = config.backbone
-        return backbone.out_capacity if layer == "out" else backbone.stages[int(layer[len("stage")])].capacity
+        capacities = config.backbone.capacities(config.grid.max_voxels)
+        return capacities[-1] if layer == "out" else capacities[int(layer[len("stage")])]
     # The semantic branch works at half resolution; a transposed convolution applies its taps once per input.
     half = layer.startswith(("semantic_0", "semantic_1", "semantic_2", "semantic_lateral", "upsample"))
     return cells // 4 if half else cells

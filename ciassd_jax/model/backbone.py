@@ -33,13 +33,14 @@ class SPConvNet(nn.Module):
         """The BEV map (z layers folded into the channels), and sites kept and dropped at each strided stage."""
         layer = partial(SparseConvNormRelu, dtype=self.dtype, axis_name=self.axis_name)
         shapes = self.config.stage_shapes(self.shape)
+        capacities = self.config.capacities(voxels.num_points.shape[-1])
         sites = _sites_of(voxels, self.shape, self.config.backend)
         x = jnp.asarray(voxels.features).reshape(-1, voxels.features.shape[-1])
         kept, dropped = [], []
         for i, stage in enumerate(self.config.stages):
             if i > 0:
                 step = _Strided(shapes[i - 1], shapes[i], (3, 3, 3), (2, 2, 2), (stage.z_padding, 1, 1))
-                sites, convolution, lost = step.plan(sites, stage.capacity, self.config.backend)
+                sites, convolution, lost = step.plan(sites, capacities[i], self.config.backend)
                 x = layer(stage.channels, (3, 3, 3), name=f"stage{i}_down")(x, convolution, _real(sites), train=train)
                 kept.append(sites.count)
                 dropped.append(lost)
@@ -47,7 +48,7 @@ class SPConvNet(nn.Module):
             for j in range(stage.layers):
                 x = layer(stage.channels, (3, 3, 3), name=f"stage{i}_{j}")(x, convolution, _real(sites), train=train)
         step = _Strided(shapes[-2], shapes[-1], (3, 1, 1), (2, 1, 1), (0, 0, 0))
-        sites, convolution, lost = step.plan(sites, self.config.out_capacity, self.config.backend)
+        sites, convolution, lost = step.plan(sites, capacities[-1], self.config.backend)
         x = layer(self.config.out_channels, (3, 1, 1), name="out")(x, convolution, _real(sites), train=train)
         bev = _fold_height(x.reshape(*sites.keys.shape, -1), sites, shapes[-1])
         return bev, jnp.stack([*kept, sites.count], -1), jnp.stack([*dropped, lost], -1)
