@@ -1,20 +1,18 @@
 """Boxes and their footprints on the ground: corners, collisions, and the points inside a box.
 
-Written once for jax.numpy and NumPy, in the arrays' float type.
+Every function works on JAX and NumPy arrays and keeps their float type; a mix of both gives JAX arrays.
 """
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Bool, Float
 
 from ciassd_jax.types import Array, Boxes
 
 
 def footprint_corners(boxes: Boxes) -> Float[Array, "*n 4 2"]:
-    """Corners (x, y) of the footprints in metres, counter-clockwise from the front left one."""
-    xp = np if isinstance(boxes.yaw, np.ndarray) else jnp
+    """Return the corners (x, y) of the footprints in metres, counter-clockwise from the front left one."""
+    xp = boxes.size.__array_namespace__()
     cosine, sine = xp.cos(boxes.yaw), xp.sin(boxes.yaw)
     along, across = boxes.size[..., 0] / 2, boxes.size[..., 1] / 2
     corners = [
@@ -31,20 +29,19 @@ def footprint_corners(boxes: Boxes) -> Float[Array, "*n 4 2"]:
 
 
 def box_corners(boxes: Boxes) -> Float[Array, "*n 8 3"]:
-    """Corners (x, y, z) of boxes in metres: the footprint's at the bottom, then those above them."""
-    xp = np if isinstance(boxes.yaw, np.ndarray) else jnp
+    """Return the corners (x, y, z) of boxes in metres: the four at the bottom, then the four above them."""
+    xp = boxes.size.__array_namespace__()
     around, middle, half = footprint_corners(boxes), boxes.center[..., 2:, None], boxes.size[..., 2:, None] / 2
     flat = xp.zeros_like(around[..., :1])
     return xp.concatenate([xp.concatenate([around, flat + middle + side * half], -1) for side in (-1, 1)], -2)
 
 
 def footprints_collide(a: Boxes, b: Boxes) -> Bool[Array, "*n"]:
-    """Whether the interiors of two footprints meet; leading axes broadcast.
+    """Return whether the interiors of two footprints intersect, by the separating axis theorem.
 
-    They do not if some edge's direction separates them (separating axes). Touching is no collision, and a
-    footprint without area collides with nothing: padding does not.
+    Leading axes broadcast. Footprints that only touch do not collide, and one without area (padding) never does.
     """
-    xp = np if isinstance(a.yaw, np.ndarray) and isinstance(b.yaw, np.ndarray) else jnp
+    xp = (a.size + b.size).__array_namespace__()
     turn = b.yaw - a.yaw
     cosine, sine = abs(xp.cos(turn)), abs(xp.sin(turn))
     dx, dy = b.center[..., 0] - a.center[..., 0], b.center[..., 1] - a.center[..., 1]
@@ -59,9 +56,12 @@ def footprints_collide(a: Boxes, b: Boxes) -> Bool[Array, "*n"]:
 
 
 def points_in_boxes(points: Float[Array, "P C"], boxes: Boxes) -> Bool[Array, "G P"]:
-    """Which points (x, y, z first) lie strictly inside which of G boxes; false for NaN and boxes without volume."""
-    xp = np if isinstance(points, np.ndarray) and isinstance(boxes.yaw, np.ndarray) else jnp
+    """Return which of P points (x, y, z first) lie strictly inside which of G boxes.
+
+    NaN is inside nothing, and nothing is inside a box without volume.
+    """
     dx, dy, dz = (points[None, :, axis] - boxes.center[:, axis, None] for axis in range(3))
+    xp = dx.__array_namespace__()
     along, across, above = (boxes.size[:, axis, None] / 2 for axis in range(3))
     cosine, sine = xp.cos(boxes.yaw)[:, None], xp.sin(boxes.yaw)[:, None]
     inside = (xp.abs(dx * cosine + dy * sine) < along) & (xp.abs(dy * cosine - dx * sine) < across)

@@ -7,7 +7,7 @@ import pytest
 
 from ciassd_jax.formats.kitti import image_size_for, lidar_to_image, read_calibration
 from ciassd_jax.formats.points import read_points
-from ciassd_jax.ops.camera import frustum_planes, inside_planes, project
+from ciassd_jax.ops.camera import clip_to_depth, frustum_planes, inside_planes, project
 
 # A camera at the LiDAR that looks along x: u = 600 - 700 y / x, v = 180 - 700 z / x.
 PROJECTION = np.array([[600.0, -700.0, 0.0, 45.0], [180.0, 0.0, -700.0, 0.2], [1.0, 0.0, 0.0, 0.003]])
@@ -95,3 +95,11 @@ def test_frustum_crop_of_the_full_cloud_is_the_reduced_cloud(shared):
         points = read_points(path)
         reduced = read_points(shared / "kitti/training/velodyne_reduced" / path.name)
         np.testing.assert_array_equal(points[inside_planes(points[:, :3], planes)], reduced)
+
+
+def test_points_that_are_too_near_move_to_the_nearest_depth():
+    points = np.array([[1.0, 2.0, -1.0], [1.0, 2.0, 3.0], [1.0, 2.0, -1.0], [np.nan] * 3])
+    ends = np.array([[5.0, 2.0, 3.0], [1.0, 2.0, -1.0], [1.0, 2.0, 0.5], [1.0, 2.0, 3.0]])
+    clipped = clip_to_depth(points, ends, nearest=1.0)
+    np.testing.assert_allclose(clipped[:2], [[3.0, 2.0, 1.0], points[1]])
+    assert np.isnan(clipped[2:]).all()

@@ -120,3 +120,10 @@ def test_faces_and_nan_are_outside():
     expected = [[True, False, False, False, True, False, False], [False] * 7]
     np.testing.assert_array_equal(points_in_boxes(points, box), expected)
     np.testing.assert_array_equal(points_in_boxes(jnp.asarray(points), jax.tree.map(jnp.asarray, box)), expected)
+
+
+def test_a_mix_of_numpy_and_jax_gives_jax():
+    rows = random_boxes(np.random.default_rng(4), 3)
+    wide, single = Boxes.from_array(rows), narrow(rows)
+    assert isinstance(footprints_collide(wide, single), jax.Array)
+    assert isinstance(points_in_boxes(rows.astype(np.float32), single), jax.Array)
