@@ -1,11 +1,10 @@
-"""How many frames a second does the loader give, with every augmentation?
+"""How many frames per second does the loader deliver with all augmentations?
 
 Command: python benchmarks/bench_data.py [--frames 440] [--batch 4] [--repeats 3] [--shared ../shared]
 
-The train frames of the reference data, again and again, with objects pasted from a database of them; after a first
-batch, so that neither compiling nor starting workers counts. Files come from the page cache. The host's part is
-reading, drawing and padding, the device's augmenting one batch again and again; the loader is both at once, and
-nothing else runs on the device.
+The loader repeats the train frames of the reference data, with ground-truth sampling from a database of the same
+frames. The first batch is not timed: it compiles and starts the workers. Files are in the page cache. "host" reads,
+draws objects and pads; "device" augments one batch repeatedly; "loader" is both, with no training step on the device.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from real_frames import SHARED
 
 from ciassd_jax import car, car_lite, make_batches, open_dataset
 from ciassd_jax.config import Config
@@ -27,12 +27,11 @@ from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.gt_sampling import ObjectDatabase, build_database, fingerprint_of, open_database
 from ciassd_jax.data.loader import Rows, Stream, finish_scenes, host_batches
 
-SHARED = Path(__file__).parents[2] / "shared"
 WORKERS = (0, 2)
 
 
 def measure(arguments: argparse.Namespace, next_batch: Callable[[], object]) -> str:
-    """Median and range of the frames a second over the repeats, after one batch."""
+    """Return median and range of the frames per second over the repeats, after one batch."""
     number, rates = arguments.frames // arguments.batch, []
     jax.block_until_ready(next_batch())
     for _ in range(arguments.repeats):
@@ -46,7 +45,7 @@ def measure(arguments: argparse.Namespace, next_batch: Callable[[], object]) -> 
 def measure_preset(
     config: Config, dataset: Dataset, database: ObjectDatabase, arguments: argparse.Namespace
 ) -> dict[str, str]:
-    """Frames a second of each part."""
+    """Return the frames per second of each part."""
     rows, rates = Rows(Stream(dataset, config, 0, True, database), arguments.batch), {}
     for workers in WORKERS:
         host = host_batches(rows, workers=workers)

@@ -1,9 +1,9 @@
-"""How long does the evaluation of 155 real frames take, and of as many as KITTI's val set has?
+"""How long does the evaluation take for 155 real frames, and for the 3769 frames of KITTI's val split?
 
 Command: python benchmarks/bench_eval.py [--repeats 5] [--shared ../shared]
 
-The 3769 frames are the 155 again and again. Times are those of a whole evaluation in one process: reading the files,
-then every class, metric, limit and difficulty with the rows by distance. No device takes part.
+The 3769 frames are the 155 repeated. The times cover a whole evaluation in one process: reading the files, then every
+class, metric, overlap limit and difficulty, and the rows by distance. NumPy only, no device.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from real_frames import SHARED
+
 from ciassd_jax.evaluation import evaluate, read_folders
 
-SHARED = Path(__file__).parents[2] / "shared"
 VAL_FRAMES = 3769
 
 
 def measure(repeats: int, work: Callable[[], object]) -> str:
-    """Median and range of the seconds that `work` takes."""
+    """Return median and range of the seconds that `work` takes."""
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()

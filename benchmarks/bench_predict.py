@@ -1,9 +1,9 @@
-"""How long does a real frame take from points to boxes, beside the same network in torch + spconv?
+"""How long does a real frame take from points to boxes, compared with the same network in torch + spconv?
 
 Command: pip install -e '.[peer]' && python benchmarks/bench_predict.py [--frames 10] [--shared ../shared]
 
-Frames go through both detectors in turn, on the same cores, after one warm-up each. Peak memory is that of a process
-of its own for each. `--preset car_lite` times an untrained network of that preset instead, without a peer.
+Both detectors process the same frames alternately, on the same cores, after one warm-up each. Peak memory is measured
+in a separate process for each. `--preset car_lite` times an untrained network of that preset without the peer.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from real_frames import SHARED
 
 import ciassd_jax
 from ciassd_jax.config.presets import PRESETS
@@ -24,11 +25,9 @@ from ciassd_jax.formats import kitti
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.ops.camera import frustum_planes
 
-SHARED = Path(__file__).parents[2] / "shared"
-
 
 def load_frames(shared: Path, number: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Points and frustum of evenly spaced real frames."""
+    """Return points and frustum of evenly spaced real frames."""
     clouds = sorted((shared / "kitti/training/velodyne_reduced").glob("*.bin"))
     frames = []
     for cloud in clouds[:: max(1, len(clouds) // number)][:number]:
@@ -41,7 +40,7 @@ def load_frames(shared: Path, number: int) -> list[tuple[np.ndarray, np.ndarray]
 
 
 def our_detector(shared: Path, preset: str | None) -> ciassd_jax.Detector:
-    """The golden weights, or an untrained network of a preset."""
+    """Return a detector with the reference weights, or an untrained one of a preset."""
     if preset is None:
         return ciassd_jax.Detector.from_pretrained(shared / "golden/weights.pth")
     config = PRESETS[preset]()
@@ -49,7 +48,7 @@ def our_detector(shared: Path, preset: str | None) -> ciassd_jax.Detector:
 
 
 def peer_detector(shared: Path):
-    """The same network in torch + spconv on two threads."""
+    """Return the same network in torch + spconv on two threads."""
     import torch
     from peer_torch import load_peer
 
@@ -62,27 +61,27 @@ def measure_alone(kind: str, arguments: argparse.Namespace) -> None:
     detector = our_detector(arguments.shared, arguments.preset) if kind == "ours" else peer_detector(arguments.shared)
     for points, _ in load_frames(arguments.shared, arguments.frames):
         detector.detect(points)
-    # Not getrusage: its maximum is inherited from the process that started this one.
+    # Not getrusage, whose maximum is inherited from the parent process.
     status = Path("/proc/self/status").read_text()
     print(int(status.split("VmHWM:")[1].split()[0]) / 1e3)
 
 
 def peak_memory(kind: str, arguments: argparse.Namespace) -> float:
-    """Peak memory in MB of a fresh process that runs one detector."""
+    """Return the peak memory in MB of a fresh process that runs one detector."""
     command = [sys.executable, __file__, "--alone", kind, "--frames", str(arguments.frames)]
     command += ["--shared", str(arguments.shared)] + (["--preset", arguments.preset] if arguments.preset else [])
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 
 
 def timed(function, *inputs, **options) -> float:
-    """Seconds of one call."""
+    """Return the seconds of one call."""
     start = time.perf_counter()
     function(*inputs, **options)
     return time.perf_counter() - start
 
 
 def main() -> None:
-    """Time both detectors in turn and print one table."""
+    """Time both detectors alternately and print one line for each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=10)
     parser.add_argument("--repeats", type=int, default=3)
@@ -107,13 +106,13 @@ def main() -> None:
                 seconds[name].append(timed(detector.detect, points, **options))
     for name, values in seconds.items():
         print(
-            f"{name}: {1e3 * statistics.median(values):.0f} ms a frame (median; {1e3 * min(values):.0f} to "
+            f"{name}: {1e3 * statistics.median(values):.0f} ms per frame (median; {1e3 * min(values):.0f} to "
             f"{1e3 * max(values):.0f}), {1 / statistics.median(values):.1f} frames/s, "
             f"peak {peak_memory(name, arguments):.0f} MB"
         )
     if "peer" in seconds:
         ratio = statistics.median(a / b for a, b in zip(seconds["ours"], seconds["peer"], strict=True))
-        print(f"ours / peer: {ratio:.2f} (median over {len(seconds['ours'])} frames in turn)")
+        print(f"ours / peer: {ratio:.2f} (median over {len(seconds['ours'])} frames)")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""How many full turns of the LiDAR simulator does this machine make in a second?
+"""How many full LiDAR scans does the simulator produce per second?
 
 Command: python benchmarks/bench_synthetic.py
 
-A street, its scan of 360 degrees and the rays that get to each object, as `simulate` returns them: alone, in batches by
-`vmap`, and one for each core in threads, as `ciassd data synth` does it. Without labels and files.
+Each scene is one call of `simulate`: a street, its 360-degree scan and the rays that hit each object, without labels
+and files. Scenes run one by one, in batches with `vmap`, and in one thread per core as `ciassd data synth` runs them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ciassd_jax.simulation import Lidar, frame_key, simulate
 
 
 def scenes_per_second(run: Callable[[int], object], number: int, repeats: int) -> list[float]:
-    """Scenes a second of each repeat; `run` makes so many scenes from a first index."""
+    """Return the scenes per second of each repeat; `run(first)` simulates `number` scenes starting at index `first`."""
     run(0)
     rates = []
     for repeat in range(repeats):
@@ -35,7 +35,7 @@ def scenes_per_second(run: Callable[[int], object], number: int, repeats: int) -
 def main() -> None:
     """Measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=32, help="scenes a repeat")
+    parser.add_argument("--scenes", type=int, default=32, help="scenes per repeat")
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
@@ -59,8 +59,12 @@ def main() -> None:
 
     rays = Lidar().rays()
     print(f"{rays.tangent.size} x {rays.azimuth.size} rays, {os.cpu_count()} cores, JAX {jax.__version__}\n")
-    print("| how | scenes a second, median (range) |\n|---|---|")
-    for name, run in (("one by one", alone), (f"batches of {options.batch}", batched), ("a thread a core", threads)):
+    print("| how | scenes per second, median (range) |\n|---|---|")
+    for name, run in (
+        ("one by one", alone),
+        (f"batches of {options.batch}", batched),
+        ("one thread per core", threads),
+    ):
         rates = scenes_per_second(run, options.scenes, options.repeats)
         print(f"| {name} | {statistics.median(rates):.1f} ({min(rates):.1f} to {max(rates):.1f}) |", flush=True)
 

@@ -1,10 +1,10 @@
-"""How long does one training step take, points in and new parameters out, beside the same step in PyTorch?
+"""How long does one training step take, from points to new parameters, compared with the same step in PyTorch?
 
 Command: pip install -e '.[peer,viz]' && python benchmarks/bench_train_step.py --voxels --plot
 
-Real frames, not augmented, pass through both steps in turn, on the same cores, after a warm-up each. Peak memory is
-that of a process of its own for each, compilation included. `--voxels` adds the cost against the number of voxels. On
-an accelerator, and with a preset other than `car`, ours is measured alone.
+Both steps process the same real frames alternately, without augmentation, on the same cores, after one warm-up each.
+Peak memory is measured in a separate process for each and includes compilation. `--voxels` adds the time against the
+number of voxels. On an accelerator, and with a preset other than `car`, only our step is measured.
 """
 
 from __future__ import annotations
@@ -21,19 +21,18 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from real_frames import SHARED, real_batches
 
-import ciassd_jax
+from ciassd_jax import Config, PointCloud, Scene, create_train_state, train_step
 from ciassd_jax.config.presets import PRESETS
 
-SHARED = Path(__file__).parents[2] / "shared"
 PLOT = Path(__file__).with_name("train_step.png")
 SHARES = (0.25, 0.5, 0.75, 1.0)
 THREADS = 2
-Config, Scene = ciassd_jax.Config, ciassd_jax.Scene
 
 
 class Point(NamedTuple):
-    """Seconds of every step on scenes of so many voxels (mean), and seconds of compilation."""
+    """Seconds of each step at a batch size and a mean number of voxels, and seconds of compilation."""
 
     batch: int
     voxels: float
@@ -42,26 +41,19 @@ class Point(NamedTuple):
     compilation: float
 
 
-def real_batches(shared: Path, config: Config, batch: int, number: int) -> list[Scene]:
-    """Batches of real frames, not augmented."""
-    dataset = ciassd_jax.open_dataset(shared / "kitti", "all")
-    with ciassd_jax.make_batches(dataset, config, seed=0, batch_size=batch, augmented=False) as batches:
-        return [next(batches) for _ in range(number)]
-
-
 def thinned(scene: Scene, share: float) -> Scene:
-    """The scene with a random share of its points."""
+    """Return the scene with a random share of its points."""
     points, count = np.array(scene.cloud.points), np.array(scene.cloud.count)
     random = np.random.default_rng(0)
     for row, cloud in enumerate(points):
         kept = cloud[: count[row]][random.random(count[row]) < share]
         cloud[:] = np.pad(kept, ((0, len(cloud) - len(kept)), (0, 0)))
         count[row] = len(kept)
-    return jax.device_put(scene._replace(cloud=ciassd_jax.PointCloud(points, count)))
+    return jax.device_put(scene._replace(cloud=PointCloud(points, count)))
 
 
 def count_voxels(scene: Scene, config: Config) -> float:
-    """Occupied voxels a scene, on average."""
+    """Return the mean number of occupied voxels per scene."""
     points, count = np.asarray(scene.cloud.points), np.asarray(scene.cloud.count)
     low, size, cells = (np.array(each) for each in (config.grid.minimum, config.grid.voxel_size, config.grid.cells))
     number = 0
@@ -73,7 +65,7 @@ def count_voxels(scene: Scene, config: Config) -> float:
 
 
 def scaled(config: Config, share: float) -> Config:
-    """The config with a share of every capacity of sites."""
+    """Return the config with every site capacity scaled by `share`."""
     backbone = config.backbone
     first, *others = backbone.stages
     stages = (first, *(replace(stage, capacity=int(share * (stage.capacity or 0))) for stage in others))
@@ -82,22 +74,21 @@ def scaled(config: Config, share: float) -> Config:
 
 
 class OurStep:
-    """Our step, compiled for one shape; keeps its state."""
+    """Our step, compiled for one shape; it holds the train state."""
 
     def __init__(self, config: Config, scene: Scene) -> None:
-        self.state = ciassd_jax.create_train_state(jax.random.key(0), config)
+        self.config, self.state = config, create_train_state(jax.random.key(0), config)
         start = time.perf_counter()
-        step = jax.jit(ciassd_jax.train_step, static_argnames="config")
-        self.step = step.lower(self.state, scene, config).compile()
+        self.step = jax.jit(train_step).lower(self.state, scene, config).compile()
         self.compilation = time.perf_counter() - start
 
     def __call__(self, scene: Scene) -> dict[str, Any]:
-        self.state, metrics = self.step(self.state, scene)
+        self.state, metrics = self.step(self.state, scene, self.config)
         return jax.block_until_ready(metrics)
 
 
 def peer_step() -> Callable[[Scene], Any]:
-    """The peer's step from a scene of ours, unpacked beforehand."""
+    """Return the PyTorch step; it takes what `for_peer` returns."""
     import torch
     from peer_training import TrainingPeer, TrainingStep
 
@@ -106,21 +97,21 @@ def peer_step() -> Callable[[Scene], Any]:
 
 
 def for_peer(scene: Scene) -> tuple:
-    """A batch as the peer takes it."""
+    """Convert a batch to the arguments of the PyTorch step."""
     from peer_training import to_peer
 
     return to_peer(scene)
 
 
 def seconds_of(function: Callable, *inputs: Any) -> float:
-    """Seconds of one call."""
+    """Return the seconds of one call."""
     start = time.perf_counter()
     function(*inputs)
     return time.perf_counter() - start
 
 
 def measure(ours: OurStep, peer: Callable | None, scenes: list[Scene], config: Config) -> Point:
-    """Both steps on each scene in turn; the first scene is a warm-up."""
+    """Time both steps alternately on each batch; the first batch is a warm-up."""
     times: dict[str, list[float]] = {"ours": [], "peer": []}
     for scene in scenes:
         times["ours"].append(seconds_of(ours, scene))
@@ -132,7 +123,7 @@ def measure(ours: OurStep, peer: Callable | None, scenes: list[Scene], config: C
 
 
 def peak_memory(kind: str, batch: int, options: argparse.Namespace) -> float:
-    """Peak memory in GB: of a fresh process that makes two steps, or of the device so far."""
+    """Return the peak memory in GB of a fresh process that runs two steps, or of the accelerator so far."""
     if jax.default_backend() != "cpu":
         return (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", float("nan")) / 1e9
     command = [sys.executable, __file__, "--alone", kind, "--batch", str(batch), "--preset", options.preset]
@@ -141,7 +132,7 @@ def peak_memory(kind: str, batch: int, options: argparse.Namespace) -> float:
 
 
 def measure_alone(kind: str, options: argparse.Namespace) -> None:
-    """Make two steps of one kind and print the peak memory of this process in GB."""
+    """Run two steps of one kind and print the peak memory of this process in GB."""
     config = PRESETS[options.preset]()
     scenes = real_batches(options.shared, config, options.batch[0], 2)
     if kind == "ours":
@@ -152,30 +143,30 @@ def measure_alone(kind: str, options: argparse.Namespace) -> None:
         peer = peer_step()
         for scene in scenes:
             peer(*for_peer(scene))
-    # Not getrusage: its maximum is inherited from the process that started this one.
+    # Not getrusage, whose maximum is inherited from the parent process.
     print(int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1e6)
 
 
 def text_of(seconds: list[float]) -> str:
-    """Median and range in ms."""
+    """Format the median and the range in ms."""
     if not seconds:
         return "-"
     return f"{1e3 * statistics.median(seconds):.0f} ({1e3 * min(seconds):.0f} to {1e3 * max(seconds):.0f})"
 
 
 def ratio_of(point: Point) -> str:
-    """Median over the steps of ours / peer."""
+    """Format the median over the steps of ours / peer."""
     pairs = zip(point.ours, point.peer, strict=False)
     return f"{statistics.median(a / b for a, b in pairs):.2f}" if point.peer else "-"
 
 
 def print_row(*cells: str) -> None:
-    """One row of a markdown table, as soon as it is known."""
+    """Print one row of a Markdown table at once."""
     print("| " + " | ".join(cells) + " |", flush=True)
 
 
 def print_header(*cells: str) -> None:
-    """The first two rows of a markdown table."""
+    """Print the first two rows of a Markdown table."""
     print()
     print_row(*cells)
     print("|" + "---|" * len(cells), flush=True)
@@ -196,7 +187,7 @@ def against_batch(options: argparse.Namespace, config: Config, peer: Callable | 
 
 
 def against_voxels(options: argparse.Namespace, config: Config, peer: Callable | None) -> dict[str, list[Point]]:
-    """Measure one scene a batch with shares of its points, at fixed and at scaled capacity, and print the table."""
+    """Measure batches of one scene with a share of its points, at fixed and scaled capacity, and print the table."""
     whole = real_batches(options.shared, config, 1, 1 + options.steps)
     fixed = OurStep(config, whole[0])
     series: dict[str, list[Point]] = {"fixed capacity": [], "capacity scaled": []}
@@ -210,14 +201,14 @@ def against_voxels(options: argparse.Namespace, config: Config, peer: Callable |
         scenes = [thinned(scene, share) for scene in whole]
         add("fixed capacity", measure(fixed, peer, scenes, config))
         if options.scale_capacity and share < 1:
-            # A cloud loses voxels a little more slowly than points.
+            # The number of voxels falls more slowly than the number of points.
             smaller = scaled(config, share + 0.1)
             add("capacity scaled", measure(OurStep(smaller, whole[0]), None, scenes, config))
     return series
 
 
 def plot(path: Path, batches: list[Point], voxels: dict[str, list[Point]]) -> None:
-    """Both curves as one small picture."""
+    """Draw time against batch size and against voxels."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 3), layout="constrained")
@@ -235,8 +226,8 @@ def plot(path: Path, batches: list[Point], voxels: dict[str, list[Point]]) -> No
             x, medians = zip(*((x, statistics.median(seconds)) for x, seconds in measured), strict=True)
             style = "C1s--" if name == "peer" else "C0o-" if "scaled" not in name else "C2^-"
             axes.plot(x, medians, style, label=name)
-    for axes, label in ((left, "scenes a batch"), (right, "voxels of a scene (batch 1)")):
-        axes.set(xlabel=label, ylabel="seconds a step", ylim=(0, None), xlim=(0, None))
+    for axes, label in ((left, "scenes per batch"), (right, "voxels per scene (batch 1)")):
+        axes.set(xlabel=label, ylabel="seconds per step", ylim=(0, None), xlim=(0, None))
         if axes.lines:
             axes.legend(frameon=False)
     figure.savefig(path, dpi=90)
@@ -248,13 +239,13 @@ def main() -> None:
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--steps", type=int, default=5)
     parser.add_argument("--preset", choices=sorted(PRESETS), default="car")
-    parser.add_argument("--voxels", action="store_true", help="also the cost against the number of voxels")
-    parser.add_argument("--scale-capacity", action="store_true", help="with --voxels, also with smaller capacities")
+    parser.add_argument("--voxels", action="store_true", help="also measure the time against the number of voxels")
+    parser.add_argument("--scale-capacity", action="store_true", help="with --voxels, also measure smaller capacities")
     parser.add_argument("--plot", type=Path, nargs="?", const=PLOT, help="draw both curves")
-    parser.add_argument("--no-memory", action="store_true", help="leave out the processes that measure memory")
-    parser.add_argument("--no-peer", action="store_true")
+    parser.add_argument("--no-memory", action="store_true", help="skip the processes that measure memory")
+    parser.add_argument("--no-peer", action="store_true", help="measure our step only")
     parser.add_argument("--shared", type=Path, default=SHARED, help="folder of kitti/")
-    parser.add_argument("--alone", choices=("ours", "peer"), help="print the peak memory of one")
+    parser.add_argument("--alone", choices=("ours", "peer"), help="print the peak memory of one step and exit")
     options = parser.parse_args()
     if options.alone:
         measure_alone(options.alone, options)

@@ -13,7 +13,7 @@ from torch import nn
 
 
 class Pairs(NamedTuple):
-    """Rows of the input and the output that each kernel offset joins; `center` joins every row with itself."""
+    """Input and output rows of each kernel offset; offset `center` maps every row to itself."""
 
     inputs: list[torch.Tensor]
     outputs: list[torch.Tensor]
@@ -22,7 +22,7 @@ class Pairs(NamedTuple):
 
 
 class SparseConvolution(torch.autograd.Function):
-    """Gather, multiply, add for every offset. One buffer takes the sums, where plain autograd fills 27."""
+    """Gather, multiply and add for each offset, into one buffer; plain autograd would fill 27."""
 
     @staticmethod
     def forward(ctx, features: torch.Tensor, kernel: torch.Tensor, pairs: Pairs) -> torch.Tensor:
@@ -56,7 +56,7 @@ class SparseConvolution(torch.autograd.Function):
 
 
 class Kernel(nn.Module):
-    """The weight (offsets, in, out) of a sparse convolution, drawn as spconv 1 draws it."""
+    """The weight (offsets, in, out) of a sparse convolution, initialised as in spconv 1."""
 
     def __init__(self, cin: int, cout: int, offsets: int) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class Kernel(nn.Module):
 
 
 def pair_tables(coordinates: torch.Tensor, batch: int) -> tuple[list[Pairs], torch.Tensor]:
-    """Pairs of every sparse layer, layers of one resolution sharing theirs, and the coordinates of the last sites."""
+    """Return the pairs of each sparse layer (shared within a resolution) and the coordinates of the last sites."""
     shape, tables, made = SPARSE_SHAPE, [], {}
     for _, _, *rest in SPARSE_LAYERS:
         submanifold = len(rest) == 1
@@ -81,7 +81,7 @@ def pair_tables(coordinates: torch.Tensor, batch: int) -> tuple[list[Pairs], tor
         # 64 bits: index_add_ takes four times as long with 32.
         inputs, outputs = ([row[:n].long() for row, n in zip(side, number.tolist(), strict=True)] for side in pairs)
         center = len(inputs) // 2 if submanifold else None
-        if center is not None:  # spconv leaves out the half that mirrors the other
+        if center is not None:  # spconv omits the mirrored half
             inputs, outputs = inputs[:center] + inputs[center:], outputs[:center] + outputs[center:]
             inputs[center + 1 :], outputs[center + 1 :] = outputs[:center][::-1], inputs[:center][::-1]
             made[rest[0]] = Pairs(inputs, outputs, len(sites), center)

@@ -1,7 +1,7 @@
-"""The same detector in plain PyTorch and spconv on the CPU: a peer to compare speed and numbers with.
+"""The same detector in plain PyTorch and spconv on the CPU: the peer for speed and numbers.
 
-It follows the released configuration (preset `car_released`) from points to boxes and shares no code with
-`ciassd_jax`; the camera-frustum filter, which needs a calibration, is left out. With the extra `peer`:
+It follows the released configuration (preset `car_released`) from points to boxes, without the frustum filter, and
+shares no code with `ciassd_jax`. It needs the extra `peer`:
 
     python benchmarks/peer_torch.py --check    # compare with the reference data in ../shared
     python benchmarks/peer_torch.py            # median time of each stage over a few frames
@@ -27,11 +27,11 @@ MAX_POINTS, MAX_VOXELS = 5, 20000
 ANCHOR_SIZE = (1.6, 3.9, 1.56)
 SCORE_THRESHOLD, MAX_CANDIDATES, OVERLAP, SUPPORT = 0.3, 1000, 0.3, 2.6
 STAGES = ("voxelize", "sparse backbone", "neck+head", "post-processing")
-BRANCHES = {"conv_box": 7, "conv_cls": 1, "conv_iou": 1, "conv_dir": 2}  # numbers an anchor
+BRANCHES = {"conv_box": 7, "conv_cls": 1, "conv_iou": 1, "conv_dir": 2}  # numbers per anchor
 FRAMES, REPEATS = ("000010", "000068", "000095"), 5
 
 # fmt: off
-SPARSE_LAYERS = (  # in, out, then the key of a submanifold layer, or kernel, stride and padding
+SPARSE_LAYERS = (  # in, out; then the key of a submanifold layer, or kernel, stride and padding
     (4, 16, "subm0"), (16, 16, "subm0"), (16, 32, 3, 2, 1),
     (32, 32, "subm1"), (32, 32, "subm1"), (32, 64, 3, 2, 1),
     (64, 64, "subm2"), (64, 64, "subm2"), (64, 64, "subm2"), (64, 64, 3, 2, (0, 1, 1)),
@@ -46,16 +46,16 @@ TOLERANCES = {
 
 
 def voxelize(points: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """Means of the first 5 points of each voxel (V, 4) and coordinates (V, 4) as batch, z, y, x."""
+    """Return the means of the first 5 points of each voxel (V, 4) and coordinates (V, 4) as batch, z, y, x."""
     points = np.ascontiguousarray(points, np.float32)
     index = np.floor((points[:, :3] - RANGE_MIN) / VOXEL_SIZE)
     inside = ((index >= 0) & (index < GRID)).all(1)
     points, index = points[inside], index[inside].astype(np.int64)
     cell = (index[:, 2] * GRID[1] + index[:, 1]) * GRID[0] + index[:, 0]
     _, first, voxel = np.unique(cell, return_index=True, return_inverse=True)
-    voxel = np.argsort(np.argsort(first))[voxel]  # numbered in the order of the first point
+    voxel = np.argsort(np.argsort(first))[voxel]  # numbered by first point
     first = np.sort(first)
-    if len(first) > MAX_VOXELS:  # the released loop stops here altogether
+    if len(first) > MAX_VOXELS:  # the released loop stops here
         points, voxel, first = points[: first[MAX_VOXELS]], voxel[: first[MAX_VOXELS]], first[:MAX_VOXELS]
     order, count = np.argsort(voxel, kind="stable"), np.bincount(voxel)
     slot = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
@@ -71,7 +71,7 @@ def _block(conv: nn.Module, norm: type[nn.Module] = nn.BatchNorm2d) -> list[nn.M
     return [conv, norm(conv.out_channels, eps=1e-3), nn.ReLU()]
 
 
-def _conv(cin: int, cout: int, kernel: int, stride: int = 1) -> list[nn.Module]:
+def conv_norm_relu(cin: int, cout: int, kernel: int, stride: int = 1) -> list[nn.Module]:
     return _block(nn.Conv2d(cin, cout, kernel, stride, kernel // 2, bias=False))
 
 
@@ -84,20 +84,29 @@ def _sparse_conv(cin: int, cout: int, *rest) -> list[nn.Module]:
 
 
 class Neck(nn.Module):
-    """SSFA (paper, section 3.2): a spatial and a semantic branch, mixed per cell by a softmax."""
+    """SSFA (paper section 3.2): a spatial and a semantic branch, fused by a softmax per cell."""
 
     def __init__(self) -> None:
         super().__init__()
-        # The identity stands for the released code's padding layer, which shifts the names by one.
-        spatial = (*_conv(128, 128, 3), *_conv(128, 128, 3), *_conv(128, 128, 3))
+        # The identity replaces the released code's padding layer, which shifts the names by one.
+        spatial = (*conv_norm_relu(128, 128, 3), *conv_norm_relu(128, 128, 3), *conv_norm_relu(128, 128, 3))
         self.bottom_up_block_0 = nn.Sequential(nn.Identity(), *spatial)
-        semantic = (*_conv(128, 256, 3, stride=2), *_conv(256, 256, 3), *_conv(256, 256, 3))
+        semantic = (*conv_norm_relu(128, 256, 3, stride=2), *conv_norm_relu(256, 256, 3), *conv_norm_relu(256, 256, 3))
         self.bottom_up_block_1 = nn.Sequential(*semantic)
-        self.trans_0, self.trans_1 = nn.Sequential(*_conv(128, 128, 1)), nn.Sequential(*_conv(256, 256, 1))
+        self.trans_0, self.trans_1 = (
+            nn.Sequential(*conv_norm_relu(128, 128, 1)),
+            nn.Sequential(*conv_norm_relu(256, 256, 1)),
+        )
         self.deconv_block_0 = nn.Sequential(*_block(nn.ConvTranspose2d(256, 128, 3, 2, 1, 1, bias=False)))
         self.deconv_block_1 = nn.Sequential(*_block(nn.ConvTranspose2d(256, 128, 3, 2, 1, 1, bias=False)))
-        self.conv_0, self.conv_1 = nn.Sequential(*_conv(128, 128, 3)), nn.Sequential(*_conv(128, 128, 3))
-        self.w_0, self.w_1 = nn.Sequential(*_conv(128, 1, 1)[:2]), nn.Sequential(*_conv(128, 1, 1)[:2])
+        self.conv_0, self.conv_1 = (
+            nn.Sequential(*conv_norm_relu(128, 128, 3)),
+            nn.Sequential(*conv_norm_relu(128, 128, 3)),
+        )
+        self.w_0, self.w_1 = (
+            nn.Sequential(*conv_norm_relu(128, 1, 1)[:2]),
+            nn.Sequential(*conv_norm_relu(128, 1, 1)[:2]),
+        )
 
     def forward(self, bev: torch.Tensor) -> torch.Tensor:
         spatial = self.bottom_up_block_0(bev)
@@ -109,7 +118,7 @@ class Neck(nn.Module):
 
 
 class PeerDetector(nn.Module):
-    """Sparse encoder, SSFA neck and head for one cloud, with the names of the released weights."""
+    """Sparse encoder, SSFA neck and head for one cloud; parameters have the released names."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -121,9 +130,9 @@ class PeerDetector(nn.Module):
         self.bbox_head = nn.ModuleDict({"tasks": nn.ModuleList([nn.ModuleDict(head)])})
 
     def encode(self, features: torch.Tensor, coordinates: torch.Tensor) -> torch.Tensor:
-        """Bird's-eye-view map (1, 128, 200, 176) of voxels; channel = feature * 2 + z."""
-        # The sparse part runs on one thread: the CPU scatter-add of spconv 2.3.8 shares its row pointers
-        # between threads, so with two its sums are wrong and differ from run to run.
+        """Return the BEV map (1, 128, 200, 176) of voxels; channel = feature * 2 + z."""
+        # One thread for the sparse part: the CPU scatter-add of spconv 2.3.8 shares its row pointers between threads,
+        # so with two the sums are wrong and differ from run to run.
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
@@ -131,20 +140,20 @@ class PeerDetector(nn.Module):
             sparse = self.backbone["middle_conv"](sparse)
         finally:
             torch.set_num_threads(threads)
-        # spconv's own dense() gives the same numbers, but indexes with a list, which torch deprecates.
+        # spconv's dense() gives the same numbers but indexes with a list, which torch deprecates.
         bev = sparse.features.new_zeros(1, 200, 176, 64, 2)
         batch, z, y, x = sparse.indices.long().unbind(1)
         bev[batch, y, x, :, z] = sparse.features
         return bev.flatten(3).permute(0, 3, 1, 2)  # channels last in memory
 
     def predict(self, bev: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Output (70400, width) of each branch in anchor order."""
+        """Return the output (70400, width) of each branch in anchor order."""
         shared, head = self.neck(bev), self.bbox_head["tasks"][0]
         return {name: head[name](shared)[0].permute(1, 2, 0).reshape(-1, BRANCHES[name]) for name in BRANCHES}
 
     @torch.inference_mode()
     def detect(self, points: np.ndarray, timings: dict | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Boxes (N, 7) as x, y, z, w, l, h, r and scores (N,); `timings` receives the seconds of `STAGES`."""
+        """Return boxes (N, 7) as x, y, z, w, l, h, r and scores (N,); `timings` receives the seconds of `STAGES`."""
         clock = [time.perf_counter()]
 
         def lap(result):
@@ -164,7 +173,7 @@ class PeerDetector(nn.Module):
 
 
 def load_peer(path: str | Path) -> PeerDetector:
-    """The network in inference mode with the parameters of a safetensors file in the released layout."""
+    """Return the network in inference mode with the parameters of a safetensors file in the released layout."""
     # Sparse kernels: (kD, kH, kW, Cin, Cout) of spconv 1 to (Cout, kD, kH, kW, Cin) of spconv 2.
     state = {name: x.permute(4, 0, 1, 2, 3) if x.ndim == 5 else x for name, x in load_file(path).items()}
     peer = PeerDetector()
@@ -174,13 +183,13 @@ def load_peer(path: str | Path) -> PeerDetector:
 
 
 def decode(outputs: dict[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-    """Boxes, scores, predicted overlaps, directions and anchors of at most 1000 candidates, best first."""
+    """Return boxes, scores, predicted IoUs, directions and anchors of at most 1000 candidates, best first."""
     score = outputs["conv_cls"][:, 0].sigmoid()
     kept = torch.nonzero(score >= SCORE_THRESHOLD)[:, 0]
     quality = (outputs["conv_iou"][kept, 0] + 1) / 2
     score, order = (score[kept] * quality**4).sort(descending=True, stable=True)
     score, kept, quality = (part[:MAX_CANDIDATES] for part in (score, kept[order], quality[order]))
-    # Anchors by number: rows (y) slowest, then columns (x), then the angles 0 and 1.57.
+    # Anchor order: rows (y) slowest, then columns (x), then the angles 0 and 1.57.
     x, y, angle = 0.2 + kept // 2 % 176 * 0.4, kept // 352 * 0.4 - 39.8, kept % 2 * 1.57
     fixed = torch.tensor([-1.0, *ANCHOR_SIZE]).expand(len(kept), 4)
     anchors = torch.cat([x[:, None], y[:, None], fixed, angle[:, None]], 1)
@@ -191,16 +200,16 @@ def decode(outputs: dict[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
 
 
 def overlap_area(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Area of intersection (P,) of pairs of rotated rectangles (P, 5) as x, y, w, l, r.
+    """Return the intersection area (P,) of pairs of rotated rectangles (P, 5) as x, y, w, l, r.
 
-    The outline of `a` is moved to the frame of `b` and clamped into it. Clamping flattens what is outside
-    onto the border of `b`, where it encloses nothing; the area within the folded outline is the answer.
+    The outline of `a` is moved to the frame of `b` and clamped to it. Parts outside `b` collapse onto its border and
+    enclose no area, so the area within the clamped outline is the intersection.
     """
     outline = torch.tensor([[-0.5, -0.5], [-0.5, 0.5], [0.5, 0.5], [0.5, -0.5]]) * a[:, None, 2:4]
     outline = torch.view_as_complex(outline) * torch.exp(-1j * a[:, 4:])
     outline = outline + torch.complex(*(a - b)[:, None, :2].unbind(-1))
     outline = torch.view_as_real(outline * torch.exp(1j * b[:, 4:]))
-    for axis in (0, 1):  # every edge gets two more corners, where it crosses the two borders of this axis
+    for axis in (0, 1):  # add two corners to every edge, where it crosses the borders of this axis
         edge, border = outline.roll(-1, 1) - outline, b[:, 2 + axis, None, None] / 2
         step = torch.where(edge[..., axis] == 0, 1.0, edge[..., axis])[..., None]
         crossing = (torch.cat([-border, border], 2) - outline[..., axis, None]) / step
@@ -213,7 +222,7 @@ def overlap_area(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def pairwise_iou(boxes: torch.Tensor) -> torch.Tensor:
-    """Rotated bird's-eye-view IoU (K, K); only pairs whose circumscribed circles meet are computed."""
+    """Return the rotated BEV IoU (K, K), computed only for pairs whose circumscribed circles meet."""
     flat = boxes[:, [0, 1, 3, 4, 6]].double()
     radius = flat[:, 2:4].norm(dim=1) / 2
     near = torch.cdist(flat[:, :2], flat[:, :2]) < radius[:, None] + radius + 1e-3
@@ -226,10 +235,10 @@ def pairwise_iou(boxes: torch.Tensor) -> torch.Tensor:
 
 
 def suppress(boxes, score, quality, direction, anchors) -> tuple[torch.Tensor, ...]:
-    """The released distance-variant IoU-weighted NMS: averaged boxes, refined scores, directions.
+    """Apply the released distance-variant IoU-weighted NMS; return averaged boxes, refined scores and directions.
 
-    Support and average run over all candidates, suppressed or not, so they do not depend on the order of
-    the greedy loop, which only picks the seeds. A seed at 60 m or beyond averages to NaN.
+    Support and average use all candidates, suppressed or not, so they do not depend on the order of the greedy loop,
+    which only picks the seeds. A seed at 60 m or beyond averages to NaN.
     """
     if not len(boxes):
         return boxes, score, direction
@@ -251,7 +260,7 @@ def suppress(boxes, score, quality, direction, anchors) -> tuple[torch.Tensor, .
 
 @torch.inference_mode()
 def check(peer: PeerDetector, clouds: dict[str, np.ndarray], golden: np.lib.npyio.NpzFile) -> bool:
-    """Print the worst difference of each quantity to the reference data; True if all are tolerable."""
+    """Print the largest difference of each quantity to the reference data; return whether all are within tolerance."""
     worst = dict.fromkeys(TOLERANCES, 0.0)
     for frame, points in clouds.items():
         bev = peer.encode(*voxelize(points))
@@ -261,13 +270,13 @@ def check(peer: PeerDetector, clouds: dict[str, np.ndarray], golden: np.lib.npyi
         ours["bev_value"] = bev.flatten()[golden[f"{frame}_bev_index"]]
         ours["ssfa_value"] = peer.neck(bev).flatten()[golden[f"{frame}_ssfa_index"]]
         ours["nms_boxes"], ours["nms_scores"], ours["nms_dirs"] = suppress(*decode(outputs))
-        # Without the frustum filter there are more final boxes: take the nearest of each of the reference.
+        # Without the frustum filter there are more final boxes: compare each reference box with the nearest.
         boxes, _ = peer.detect(points)
         final = torch.from_numpy(golden[f"{frame}_final_boxes"]).float()
         ours["final_boxes"] = boxes[torch.cdist(final, boxes, torch.inf).argmin(1)]
         for name in worst:
             found, expected = ours[name].numpy().ravel(), golden[f"{frame}_{name}"].ravel()
-            np.testing.assert_array_equal(np.isnan(found), np.isnan(expected), name)  # and the sizes agree
+            np.testing.assert_array_equal(np.isnan(found), np.isnan(expected), name)  # also checks the shapes
             worst[name] = max(worst[name], np.nanmax(np.abs(found - expected)))
     for name, tolerance in TOLERANCES.items():
         print(f"{name:<14}{worst[name]:9.1e}  tolerance {tolerance:.0e}")

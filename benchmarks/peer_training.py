@@ -1,10 +1,10 @@
-"""The same training step in plain PyTorch on the CPU: a peer to compare speed and numbers with.
+"""The same training step in plain PyTorch on the CPU: the peer for speed and numbers.
 
-Points in, new parameters out, as preset `car` trains: voxeliser and dense layers of `peer_torch.py`, sparse layers of
-`peer_sparse.py`, targets, losses, AdamW. It shares no code with `ciassd_jax`. With the extra `peer`:
+It trains like preset `car`, from points to new parameters: voxeliser and dense layers of `peer_torch.py`, sparse layers
+of `peer_sparse.py`, targets, losses, AdamW. It shares no code with `ciassd_jax`. It needs the extra `peer`:
 
     python benchmarks/peer_training.py --check      # compare losses and gradients with ours, on real frames
-    python benchmarks/peer_training.py --batch 4    # where the time of a step goes
+    python benchmarks/peer_training.py --batch 4    # time of each part of a step
 """
 
 import argparse
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from bench_train_step import SHARED, real_batches
 from peer_sparse import Kernel, Pairs, SparseConvolution, pair_tables
-from peer_torch import ANCHOR_SIZE, BRANCHES, SPARSE_LAYERS, Neck, _conv, overlap_area, voxelize
+from peer_torch import ANCHOR_SIZE, BRANCHES, SPARSE_LAYERS, Neck, conv_norm_relu, overlap_area, voxelize
+from real_frames import SHARED, real_batches
 from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
@@ -32,7 +32,7 @@ TERM_TOLERANCE, GRADIENT_TOLERANCE = 1e-4, 1e-2  # relative
 
 
 class TrainingPeer(nn.Module):
-    """The network of preset `car` with the names of the released weights, for a batch of clouds."""
+    """The network of preset `car` for a batch of clouds; parameters have the released names."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -41,8 +41,12 @@ class TrainingPeer(nn.Module):
             offsets = 3 if rest[0] == (3, 1, 1) else 27
             layers += [Kernel(cin, cout, offsets), nn.BatchNorm1d(cout, eps=1e-3), nn.ReLU(inplace=True)]
         self.backbone = nn.ModuleDict({"middle_conv": nn.ModuleList(layers)})
+
+        def attention() -> nn.Module:
+            return nn.Sequential(*conv_norm_relu(128, 1, 3)[:2])
+
         self.neck = Neck()
-        self.neck.w_0, self.neck.w_1 = nn.Sequential(*_conv(128, 1, 3)[:2]), nn.Sequential(*_conv(128, 1, 3)[:2])
+        self.neck.w_0, self.neck.w_1 = attention(), attention()
         head = {name: nn.Conv2d(128, 2 * width, 1) for name, width in BRANCHES.items()}
         self.bbox_head = nn.ModuleDict({"tasks": nn.ModuleList([nn.ModuleDict(head)])})
         for module in self.modules():
@@ -50,7 +54,7 @@ class TrainingPeer(nn.Module):
                 module.momentum = 0.01
 
     def encode(self, features: torch.Tensor, tables: list[Pairs], sites: torch.Tensor, batch: int) -> torch.Tensor:
-        """Bird's-eye-view map (B, 128, 200, 176); channel = feature * 2 + z."""
+        """Return the BEV map (B, 128, 200, 176); channel = feature * 2 + z."""
         layers = iter(self.backbone["middle_conv"])
         for kernel, norm, relu, pairs in zip(layers, layers, layers, tables, strict=True):
             features = relu(norm(SparseConvolution.apply(features, kernel.weight, pairs)))
@@ -60,7 +64,7 @@ class TrainingPeer(nn.Module):
         return bev.flatten(3).permute(0, 3, 1, 2)  # channels last in memory
 
     def predict(self, bev: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Output (B, 70400, width) of each branch in anchor order."""
+        """Return the output (B, 70400, width) of each branch in anchor order."""
         shared, head = self.neck(bev), self.bbox_head["tasks"][0]
         return {
             name: head[name](shared).permute(0, 2, 3, 1).reshape(len(bev), -1, width)
@@ -69,7 +73,7 @@ class TrainingPeer(nn.Module):
 
 
 def make_anchors() -> torch.Tensor:
-    """Anchors (70400, 7) as x, y, z, w, l, h, r: y slowest, then x, then r."""
+    """Return the anchors (70400, 7) as x, y, z, w, l, h, r: y slowest, then x, then r."""
     y, x, r = np.meshgrid(np.arange(200) * 0.4 - 39.8, np.arange(176) * 0.4 + 0.2, [0, np.pi / 2], indexing="ij")
     fixed = np.broadcast_to([-1.0, *ANCHOR_SIZE], (*x.shape, 4))
     anchors = np.concatenate([x[..., None], y[..., None], fixed, r[..., None]], -1).reshape(-1, 7)
@@ -77,7 +81,7 @@ def make_anchors() -> torch.Tensor:
 
 
 def aligned(boxes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lowest and highest x, y (N, 2) of boxes turned to the nearest axis."""
+    """Return the lowest and highest x, y (N, 2) of boxes rotated to the nearest axis."""
     r = boxes[:, 6]
     turned = ((r - torch.floor(r / torch.pi + 0.5) * torch.pi).abs() > torch.pi / 4)[:, None]
     half = torch.where(turned, boxes[:, [4, 3]], boxes[:, [3, 4]]) / 2
@@ -85,7 +89,7 @@ def aligned(boxes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def assign(truth: torch.Tensor, anchors: torch.Tensor, corners: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-    """Label (A,) of each anchor (1, 0, -1 for ignored) and the truth box (G, 7) that it overlaps most."""
+    """Return label (A,) of each anchor (1, 0, -1 for ignored) and the index (A,) of the box that it overlaps most."""
     if not len(truth):
         return torch.zeros(len(anchors), dtype=torch.long), torch.zeros(len(anchors), dtype=torch.long)
     low, high = (side[:, None] for side in aligned(truth))
@@ -99,7 +103,7 @@ def assign(truth: torch.Tensor, anchors: torch.Tensor, corners: tuple) -> tuple[
 
 
 def box_overlap(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """3D IoU (P,) of pairs of rotated boxes (P, 7)."""
+    """Return the 3D IoU (P,) of pairs of rotated boxes (P, 7)."""
     flat = [0, 1, 3, 4, 6]
     top = torch.minimum(a[:, 2] + a[:, 5] / 2, b[:, 2] + b[:, 5] / 2)
     bottom = torch.maximum(a[:, 2] - a[:, 5] / 2, b[:, 2] - b[:, 5] / 2)
@@ -108,7 +112,7 @@ def box_overlap(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 class TrainingStep:
-    """A network, its optimiser and schedule; calling it makes one update."""
+    """A network with optimiser and schedule; calling it runs one update."""
 
     def __init__(self, peer: TrainingPeer, channels_last: bool = True) -> None:
         dense = nn.ModuleList([peer.neck, peer.bbox_head])
@@ -130,7 +134,7 @@ class TrainingStep:
     def __call__(
         self, clouds: Sequence[np.ndarray], truths: Sequence[torch.Tensor], timings: dict | None = None
     ) -> dict[str, float]:
-        """Loss terms and positives a scene; boxes (G, 7) as x, y, z, w, l, h, r; `timings` gets seconds of `STAGES`."""
+        """Return loss terms and positives per scene; a truth is (x, y, z, w, l, h, r); `timings` gets the seconds."""
         clock, batch = [time.perf_counter()], len(clouds)
 
         def lap(result=None):
@@ -145,7 +149,7 @@ class TrainingStep:
         lap()
         tables, sites = lap(pair_tables(coordinates, batch))
         bev = lap(self.peer.encode(features, tables, sites, batch))
-        # Cut here, so that the two halves of the backward pass can be timed.
+        # Detached here, so that the two halves of the backward pass can be timed.
         middle = bev.detach().contiguous(memory_format=self.layout).requires_grad_()
         outputs = lap(self.peer.predict(middle))
         terms, positives = self.losses(outputs, truths)
@@ -165,7 +169,7 @@ class TrainingStep:
     def losses(
         self, outputs: dict[str, torch.Tensor], truths: Sequence[torch.Tensor]
     ) -> tuple[dict[str, torch.Tensor], int]:
-        """Loss terms, each a mean over scenes of sums divided by the scene's positives, and how many positives."""
+        """Return the loss terms, each divided by the scene's positives and averaged, and the number of positives."""
         assigned = [assign(truth, self.anchors, self.corners) for truth in truths]
         label = torch.stack([each for each, _ in assigned])
         weight = 1 / (label == 1).sum(1).clamp(min=1) / len(truths)
@@ -174,7 +178,7 @@ class TrainingStep:
 
         logit, target = outputs["conv_cls"][..., 0], (label == 1).to(self.dtype)
         entropy = binary_cross_entropy_with_logits(logit, target, reduction="none")
-        # 1 - p of the right class; its logarithm is stabler than p, as entropy = -log p.
+        # The focal factor is 1 - p of the target class; entropy = -log p gives it accurately.
         focal = torch.where(label == 1, 0.25, 0.75) * (-torch.expm1(-entropy)) ** 2 * entropy
         classification = (torch.where(label >= 0, focal, 0).sum(1) * weight).sum()
 
@@ -196,12 +200,12 @@ class TrainingStep:
 
 
 def smooth(error: torch.Tensor) -> torch.Tensor:
-    """Smooth-L1 of sigma 3."""
+    """Return the smooth-L1 loss with sigma 3."""
     return smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=1 / 9)
 
 
 def to_peer(scene) -> tuple[list[np.ndarray], list[torch.Tensor]]:
-    """Clouds and truth boxes of a batched `Scene` of ours, without the padding."""
+    """Return clouds and truth boxes of a batched `Scene`, without padding."""
     points, count = np.asarray(scene.cloud.points), np.asarray(scene.cloud.count)
     rows, label = np.asarray(scene.truth.boxes.to_array()), np.asarray(scene.truth.label)
     r = -(rows[..., 6] + np.float32(np.pi / 2))
@@ -212,7 +216,7 @@ def to_peer(scene) -> tuple[list[np.ndarray], list[torch.Tensor]]:
 
 
 def released_layout(name: str, ours: dict, targets: dict[str, str]) -> np.ndarray:
-    """The leaf of our variables that belongs to a released name, with the axes that the peer has."""
+    """Return the leaf of our variables for a released name, with the peer's axes."""
     leaf = ours
     for key in targets[name].split("/"):
         leaf = leaf[key]
@@ -223,9 +227,9 @@ def released_layout(name: str, ours: dict, targets: dict[str, str]) -> np.ndarra
 
 
 def check(shared: Path, batch: int) -> bool:
-    """One step of ours and of the peer from the same weights and scenes; True if losses and gradients agree.
+    """Run one step of ours and of the peer from the same weights and scenes; return whether both agree.
 
-    The peer is in float64 here: its float32 is up to 1e-4 off in the losses and 5e-2 in the backbone's gradients.
+    The peer runs in float64: in float32 its losses are up to 1e-4 and its backbone gradients up to 5e-2 off.
     """
     import jax
     import optax
@@ -244,11 +248,11 @@ def check(shared: Path, batch: int) -> bool:
         if name in targets:
             value.copy_(torch.from_numpy(released_layout(name, ours, targets).copy()))
     step = TrainingStep(peer.double())
-    new_state, metrics = jax.jit(ciassd_jax.train_step, static_argnames="config")(state, scene, config)
+    new_state, metrics = jax.jit(ciassd_jax.train_step)(state, scene, config)
     clouds, truths = to_peer(scene)
     said = step(clouds, [truth.double() for truth in truths])
     worst = {name: (abs(value / float(metrics[name]) - 1), TERM_TOLERANCE) for name, value in said.items()}
-    # After the first step Adam's first moment is the clipped gradient, up to a factor that both share.
+    # After the first step Adam's first moment is the clipped gradient times a factor that both share.
     moments = {"params": optax.tree.get(new_state.optimizer, "mu")}
     for name, parameter in peer.named_parameters():
         mine, moment = released_layout(name, moments, targets), step.optimizer.state[parameter]["exp_avg"].numpy()
@@ -264,7 +268,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="compare losses and gradients with ours")
     parser.add_argument("--batch", type=int, default=2)
     parser.add_argument("--steps", type=int, default=5)
-    parser.add_argument("--channels-first", action="store_true", help="the other layout of the dense layers")
+    parser.add_argument("--channels-first", action="store_true", help="use channels-first dense layers")
     parser.add_argument("--shared", type=Path, default=SHARED, help="folder of golden/ and kitti/")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
