@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 from small import CALIBRATION, IMAGE_SIZE
 
-from ciassd_jax.formats.kitti import boxes_to_rows, format_row, read_calibration
+from ciassd_jax.formats.kitti_boxes import boxes_to_rows
+from ciassd_jax.formats.kitti_camera import read_calibration
+from ciassd_jax.formats.kitti_rows import format_row
 from ciassd_jax.formats.points import write_bin
 from ciassd_jax.types import Boxes
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from ciassd_jax.data.splits import official_split
 from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes
-from ciassd_jax.formats.kitti import parse_row, read_lines
+from ciassd_jax.formats.kitti_rows import parse_row
+from ciassd_jax.formats.lines import read_lines
 from ciassd_jax.formats.writing import replacing
 
 # Fixed, so that the same results make the same archive.

@@ -6,24 +6,29 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int
 
+from ciassd_jax.formats.custom_rows import CustomRow
 from ciassd_jax.formats.errors import FormatWarning, Pathlike
 from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.kitti_rows import ObjectRow
 from ciassd_jax.formats.points import scale_intensity
 from ciassd_jax.types import Boxes
+
+# Number of points inside an object from which it is easy, moderate, hard, for data without a camera.
+_POINTS_OF_DIFFICULTY = (100, 30, 5)
 
 
 class Frame(NamedTuple):
     """A labelled frame of P points and G objects in the LiDAR frame, as NumPy arrays.
 
-    `points` (x, y, z, intensity) are finite and, where there is a camera, those that it sees. `boxes` are float64,
-    `names` the types of the objects in the order of the label file without DontCare. `difficulty` is 0 (easy), 1,
-    2 (hard) or -1 (none of them): KITTI's of the label with a camera (SPEC 1.4), without one `difficulty_by_points`.
-    `rows` are the rows of the label file as read, DontCare among them.
+    `points` (x, y, z, intensity) are finite and, with a camera, only those that it sees. `boxes` are float64 and
+    `names` the types of the objects, in the order of the label file without DontCare. `difficulty` is 0 (easy), 1,
+    2 (hard) or -1 (none of them): KITTI's with a camera, `difficulty_by_points` without one. `rows` are the rows of
+    the label file as read, DontCare among them: KITTI's with a camera. They are None for a frame without labels.
     """
 
     name: str
@@ -32,14 +37,14 @@ class Frame(NamedTuple):
     names: tuple[str, ...]
     difficulty: Int[np.ndarray, " G"]
     camera: Camera | None
-    rows: tuple[Any, ...] = ()
+    rows: tuple[ObjectRow, ...] | tuple[CustomRow, ...] | None = None
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """The frames of one split by name; `read_frame` reads one of them. Workers can pickle it.
+    """The frames of one split by name; `read_frame` reads one of them. Worker processes can pickle it.
 
-    `find_files` gives the files that a frame is read from; frames of other origin have none.
+    `find_files` returns the files that a frame is read from; None for frames that do not come from files.
     """
 
     names: tuple[str, ...]
@@ -50,26 +55,25 @@ class Dataset:
         return len(self.names)
 
     def read(self, index: int) -> Frame:
-        """The frame with that place in `names`; raises InputError for a file that cannot be used."""
+        """Read the frame `names[index]`; raises InputError for a file that cannot be used."""
         return self.read_frame(self.names[index])
 
     def sources(self, index: int) -> tuple[Path, ...]:
-        """The files that the frame with that place is read from."""
+        """Return the files that the frame `names[index]` is read from."""
         return self.find_files(self.names[index]) if self.find_files else ()
 
 
-# An object with so many points inside is easy, moderate, hard where no camera says how large it looks.
-_POINTS_OF_DIFFICULTY = (100, 30, 5)
-
-
 def difficulty_by_points(inside: Int[np.ndarray, " G"]) -> Int[np.ndarray, " G"]:
-    """Difficulty by the number of points inside each box: 0 from 100, 1 from 30, 2 from 5, else -1."""
+    """Return the difficulty by the number of points inside each box: 0 from 100, 1 from 30, 2 from 5, else -1."""
     levels = (inside[:, None] >= np.array(_POINTS_OF_DIFFICULTY)).sum(-1)
     return np.where(levels > 0, len(_POINTS_OF_DIFFICULTY) - levels, -1)
 
 
 def clean_points(points: Float32[np.ndarray, "N 4"], path: Pathlike) -> Float32[np.ndarray, "P 4"]:
-    """The finite points of a file, with intensity in [0, 1]: divided by 255 where it exceeds 2; warns of both."""
+    """Return the finite points of a file with intensity in [0, 1].
+
+    Intensities are divided by 255 if they exceed 2. A FormatWarning tells what was dropped or scaled.
+    """
     finite = np.isfinite(points).all(1)
     if not finite.all():
         text = f"{path}: {(~finite).sum()} of {len(points)} points are not finite; they were left out."

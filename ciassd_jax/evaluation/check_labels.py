@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from ciassd_jax.config import Config
-from ciassd_jax.data.custom import parse_custom_row
-from ciassd_jax.data.kitti import IGNORED, TYPES
 from ciassd_jax.evaluation.findings import Finding, Labelled
+from ciassd_jax.formats.custom_rows import parse_custom_row
 from ciassd_jax.formats.errors import InputError
-from ciassd_jax.formats.kitti import Calibration, ObjectRow, boxes_to_rows, parse_row, read_lines, rows_to_boxes
-from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.kitti_boxes import boxes_to_rows, rows_to_boxes
+from ciassd_jax.formats.kitti_camera import Calibration, Camera
+from ciassd_jax.formats.kitti_rows import DONT_CARE, OBJECT_TYPES, ObjectRow, parse_row
+from ciassd_jax.formats.lines import read_lines
 
 # Labels are rounded to two decimals, so half a turn may read 3.15.
 _LARGEST_HEADING = math.pi + 0.01
@@ -43,7 +44,7 @@ def read_labelled(path: Path, calibration: Calibration | None) -> tuple[list[Lab
                 objects.append(Labelled(place, custom.type, np.array(custom.box), None))
             else:
                 row = parse_row(line, place)
-                if row.type != IGNORED:
+                if row.type != DONT_CARE:
                     box = np.asarray(rows_to_boxes([row], calibration).to_array()[0])
                     objects.append(Labelled(place, row.type, box, row))
         except InputError as error:
@@ -67,8 +68,10 @@ def check_object(labelled: Labelled) -> Iterator[Finding]:
 
 
 def _check_row(place: str, row: ObjectRow) -> Iterator[Finding]:
-    if row.type not in TYPES:
-        yield Finding("type", True, f"{place}: the type '{row.type}' is none of KITTI's; write {', '.join(TYPES)}.")
+    if row.type not in OBJECT_TYPES:
+        yield Finding(
+            "type", True, f"{place}: the type '{row.type}' is none of KITTI's; write {', '.join(OBJECT_TYPES)}."
+        )
     x1, y1, x2, y2 = row.bbox
     if x2 <= x1 or y2 <= y1:
         yield Finding(

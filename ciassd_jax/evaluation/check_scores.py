@@ -13,8 +13,9 @@ from ciassd_jax.evaluation.kitti_ap import LIMITS, METRICS, Metric, average_prec
 from ciassd_jax.evaluation.matching import pick_thresholds
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
 from ciassd_jax.evaluation.summary import evaluate
-from ciassd_jax.formats.kitti import ObjectRow, boxes_to_rows
+from ciassd_jax.formats.kitti_boxes import boxes_to_rows
 from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.kitti_rows import ObjectRow
 from ciassd_jax.types import Boxes
 
 # A curve has so many points: with fewer objects the official rule leaves the last ones 0.

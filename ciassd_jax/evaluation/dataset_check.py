@@ -13,7 +13,7 @@ from ciassd_jax.config import Config, GridConfig
 from ciassd_jax.data.custom import PLACES as CUSTOM_PLACES
 from ciassd_jax.data.folders import find_root, is_custom
 from ciassd_jax.data.frames import clean_points
-from ciassd_jax.data.kitti import IMAGE, crop_to_view, crop_without_images, is_reduced, kitti_folder
+from ciassd_jax.data.kitti import IMAGE, crop_to_view, crop_without_images, kitti_folder
 from ciassd_jax.data.splits import ALL, Places, find_file, listed_names, missing_files, repeated_names
 from ciassd_jax.evaluation.check_labels import check_object, check_projection, check_types, read_labelled
 from ciassd_jax.evaluation.findings import CheckedFrame, Finding, Labelled, Report, TypeSummary
@@ -131,7 +131,7 @@ def _read_cloud(
     if ((points[:, 3] < 0) | (points[:, 3] > 1)).any():
         text = f"{path}: intensities are not all in [0, 1]; scale them so."
         findings.append(Finding("intensity", False, text))
-    if camera is not None and not is_reduced(path):
+    if camera is not None and path.parent.name != "velodyne_reduced":
         points = crop_to_view(points, camera)
     if not len(points):
         findings.append(Finding("few points", True, f"{path}: no point is left; check the calibration and the cloud."))

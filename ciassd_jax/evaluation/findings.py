@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int
 
-from ciassd_jax.formats.kitti import ObjectRow
 from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.kitti_rows import ObjectRow
 
 
 class Finding(NamedTuple):

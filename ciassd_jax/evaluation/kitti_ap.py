@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64, Int
 from ciassd_jax.evaluation.matching import Candidates, assign, order_candidates, pick_thresholds
 from ciassd_jax.evaluation.objects import DetectedObjects, FlatObjects, LabelledObjects, flatten, select
 from ciassd_jax.evaluation.overlap import Geometry, Intersections, intersect
-from ciassd_jax.formats.kitti_difficulty import DIFFICULTIES
+from ciassd_jax.formats.kitti_rows import DIFFICULTIES
 
 Metric = Literal["bbox", "bev", "3d", "aos"]
 Recall = Literal["R11", "R40"]

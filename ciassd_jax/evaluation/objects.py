@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int
 
-from ciassd_jax.formats.kitti import ObjectRow
-from ciassd_jax.formats.kitti_difficulty import difficulty_of
+from ciassd_jax.formats.kitti_rows import ObjectRow, difficulty_of
 from ciassd_jax.types import Boxes
 
 # What KITTI writes for a location that is not given.

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from ciassd_jax.evaluation.breakdown import Row
 from ciassd_jax.evaluation.kitti_ap import LIMITS, METRICS, Metric, Recall, average_precision
 from ciassd_jax.evaluation.summary import Evaluation
-from ciassd_jax.formats.kitti_difficulty import DIFFICULTIES
+from ciassd_jax.formats.kitti_rows import DIFFICULTIES
 
 # By class, metric, R11 or R40, and limit of overlap.
 Precisions = dict[str, dict[str, dict[str, dict[str, list[float | None] | None]]]]

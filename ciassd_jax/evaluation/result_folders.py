@@ -7,8 +7,7 @@ from pathlib import Path
 
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike
-from ciassd_jax.formats.kitti import read_rows
-from ciassd_jax.formats.kitti_results import read_results
+from ciassd_jax.formats.kitti_rows import read_results, read_rows
 
 # Fields of ResultFile, and what is done with their lines.
 _ODD_ROWS = {
@@ -43,7 +42,7 @@ def read_folders(labels: Pathlike, results: Pathlike) -> tuple[list[LabelledObje
     truths = [labels_from_rows(read_rows(label_files[name])) for name in result_files]
     read = {path: read_results(path) for path in result_files.values()}
     for field, what in _ODD_ROWS.items():
-        places = [f"{path}, line {line}" for path, found in read.items() for line in getattr(found, field)]
+        places = [place for found in read.values() for place in getattr(found, field)]
         if places:
             _warn(f"{what}: {len(places)} in all, the first is {places[0]}.")
     return truths, [detections_from_rows(found.rows) for found in read.values()]

@@ -1,16 +1,43 @@
-"""A frame's camera from its files: the calibration and the size of the image."""
+"""KITTI's camera: its calibration file, the size of its image, and what it sees.
+
+The rectified camera frame has x right, y down and z forward, in metres; pixels are (u, v) of the left colour image.
+"""
 
 from __future__ import annotations
 
+import math
+import struct
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
-from ciassd_jax.formats.errors import InputError, Pathlike
-from ciassd_jax.formats.kitti import Calibration, image_size_for, lidar_to_image, read_calibration, read_png_size
+from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes
+from ciassd_jax.formats.lines import read_text
 from ciassd_jax.ops.camera import frustum_planes
+
+# Width and height of the image by focal length, which differ between KITTI's recording days.
+_IMAGE_SIZES = {
+    721.5377: (1242, 375),
+    707.0493: (1224, 370),
+    718.3351: (1238, 374),
+    718.856: (1241, 376),
+}
+# Names of each matrix in the object and the tracking benchmark, and its shape.
+_MATRICES = (
+    (("P2",), (3, 4)),
+    (("R0_rect", "R_rect"), (3, 3)),
+    (("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4)),
+)
+
+
+class Calibration(NamedTuple):
+    """P2 (camera to pixels), R0 (camera to rectified camera) and the transform from LiDAR to camera."""
+
+    projection: Float64[np.ndarray, "3 4"]
+    rectification: Float64[np.ndarray, "3 3"]
+    velodyne_to_camera: Float64[np.ndarray, "3 4"]
 
 
 class Camera(NamedTuple):
@@ -21,10 +48,10 @@ class Camera(NamedTuple):
 
 
 def read_camera(path: Pathlike, image: Path | None = None, image_size: tuple[int, int] | None = None) -> Camera:
-    """The camera of the calibration file `path`.
+    """Read the camera from the calibration file `path`.
 
-    The size of the image is as given, else that of the PNG file `image` where it is there, else KITTI's for the focal
-    length. Raises InputError, one sentence with the remedy, where none of them says it or a file is malformed.
+    The size of the image is `image_size`, else that of the PNG file `image` if it exists, else KITTI's for the focal
+    length. Raises InputError, one sentence with the remedy, if the size is unknown or a file is malformed.
     """
     calibration = read_calibration(path)
     if image_size is None and image is not None and image.is_file():
@@ -33,17 +60,70 @@ def read_camera(path: Pathlike, image: Path | None = None, image_size: tuple[int
     if size is None:
         raise InputError(
             f"{path} has a focal length of {calibration.projection[0, 0]:g} pixels, which is none of KITTI's, so the "
-            "image could be of any size; give it with --image-size WIDTH HEIGHT."
+            "size of the image is unknown; give it as `image_size` (width, height)."
         )
     return Camera(calibration, size)
 
 
-def frustum_of(camera: Camera | None) -> Float64[np.ndarray, "6 4"] | None:
-    """`view_planes` of a camera; None without one."""
-    return None if camera is None else view_planes(camera)
+def read_calibration(path: Pathlike) -> Calibration:
+    """Read P2, R0_rect and Tr_velo_to_cam (tracking: R_rect, Tr_velo_cam) by name, in float64.
+
+    Raises InputError, one sentence with the remedy, for a line that is missing or does not hold such a matrix.
+    """
+    lines = {}
+    for line in read_text(path).splitlines():
+        key, *values = line.replace(":", " ", 1).split() or [""]
+        lines[key] = values
+    matrices = []
+    for keys, shape in _MATRICES:
+        found = [lines[key] for key in keys if key in lines]
+        if not found:
+            raise InputError(f"{path} has no line {keys[0]}; use the calibration file that KITTI gives for the frame.")
+        try:
+            matrix = np.array(found[0], np.float64).reshape(shape)
+            usable = bool(np.isfinite(matrix).all()) and abs(np.linalg.det(matrix[:, :3])) > 1e-6
+        except ValueError:
+            usable = False
+        if not usable:
+            raise InputError(
+                f"{path}, line {keys[0]}: not the {math.prod(shape)} numbers of an invertible matrix; "
+                "copy the file again."
+            )
+        matrices.append(matrix)
+    return Calibration(*matrices)
+
+
+def read_png_size(path: Pathlike) -> tuple[int, int]:
+    """Return width and height in pixels from the header of a PNG file; raises InputError for another file."""
+    data = read_bytes(path, 24)
+    if len(data) < 24 or data[:8] != b"\x89PNG\r\n\x1a\n" or data[12:16] != b"IHDR":
+        raise InputError(f"{path} is not a PNG image; give the frame's image_2 file or the image size.")
+    width, height = struct.unpack(">II", data[16:24])
+    return width, height
+
+
+def image_size_for(calibration: Calibration) -> tuple[int, int] | None:
+    """Return width and height in pixels of KITTI's images with this focal length; None for any other camera."""
+    focal_length = calibration.projection[0, 0]
+    return next((size for key, size in _IMAGE_SIZES.items() if abs(key - focal_length) < 1e-3), None)
+
+
+def lidar_to_camera(calibration: Calibration) -> Float64[np.ndarray, "3 4"]:
+    """Return R0 @ Tr, which takes homogeneous LiDAR points to the rectified camera frame."""
+    return calibration.rectification @ calibration.velodyne_to_camera
+
+
+def lidar_to_image(calibration: Calibration) -> Float64[np.ndarray, "3 4"]:
+    """Return P2 @ R0 @ Tr, which takes homogeneous LiDAR points to (u * depth, v * depth, depth)."""
+    return calibration.projection @ np.vstack([lidar_to_camera(calibration), [0.0, 0.0, 0.0, 1.0]])
 
 
 def view_planes(camera: Camera) -> Float64[np.ndarray, "6 4"]:
-    """The half-spaces of what the camera sees, for LiDAR points (`ops.camera.frustum_planes`)."""
+    """Return the half-spaces of what the camera sees, for LiDAR points (`ops.camera.frustum_planes`)."""
     width, height = camera.image_size
     return frustum_planes(lidar_to_image(camera.calibration), width=width, height=height)
+
+
+def frustum_of(camera: Camera | None) -> Float64[np.ndarray, "6 4"] | None:
+    """Return the `view_planes` of a camera, or None without one."""
+    return None if camera is None else view_planes(camera)

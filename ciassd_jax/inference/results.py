@@ -13,13 +13,15 @@ from jaxtyping import Int
 
 from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import Pathlike
-from ciassd_jax.formats.kitti import ObjectRow, boxes_to_rows, write_rows
+from ciassd_jax.formats.kitti_boxes import boxes_to_rows
 from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.kitti_rows import ObjectRow, write_rows
 from ciassd_jax.formats.writing import replacing
 from ciassd_jax.types import Boxes, Counts, Detections
 
 if TYPE_CHECKING:
-    from ciassd_jax.view.bev import Picture
+    from matplotlib.figure import Figure
+
     from ciassd_jax.view.html import Page
     from ciassd_jax.view.view_frame import ViewFrame
 
@@ -53,7 +55,7 @@ class FrameResult:
         more = [f"  ... and {len(self) - 10} more"] if len(self) > 10 else []
         return "\n".join([head, *rows, *more])
 
-    def plot_bev(self, points: np.ndarray, truth: np.ndarray | None = None) -> Picture:
+    def plot_bev(self, points: np.ndarray, truth: np.ndarray | None = None) -> Figure:
         """Bird's-eye view of points [N, 4], these and true boxes [G, 7]: a matplotlib figure that notebooks show."""
         from ciassd_jax.view.bev import plot_bev
 

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ciassd_jax.data.frames import Dataset, Frame
-from ciassd_jax.data.kitti import IGNORED, PLACES
+from ciassd_jax.data.kitti import PLACES
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
 from ciassd_jax.evaluation.summary import Evaluation, evaluate
 from ciassd_jax.formats.errors import DroppedWarning, FormatWarning, InputError, Pathlike
-from ciassd_jax.formats.kitti import format_row, read_rows
 from ciassd_jax.formats.kitti_camera import frustum_of
+from ciassd_jax.formats.kitti_rows import DONT_CARE, format_row, read_rows
 from ciassd_jax.formats.writing import replacing
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.results import FrameResult
@@ -145,7 +145,7 @@ def _labels(frame: Frame, sources: Iterable[Path]) -> LabelledObjects:
         raise InputError(f"Frame {frame.name} has no labels to compare with; take a split of labelled frames.")
     rows = read_rows(path)
     points = np.zeros(len(rows), np.int64)
-    points[[row.type != IGNORED for row in rows]] = inside
+    points[[row.type != DONT_CARE for row in rows]] = inside
     return labels_from_rows(rows)._replace(points=points)
 
 

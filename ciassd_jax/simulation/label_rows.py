@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64, Int
 
-from ciassd_jax.formats.kitti import ObjectRow, boxes_to_rows, lidar_to_image
-from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.kitti_boxes import boxes_to_rows
+from ciassd_jax.formats.kitti_camera import Camera, lidar_to_image
+from ciassd_jax.formats.kitti_rows import ObjectRow
 from ciassd_jax.ops.footprints import box_corners
 from ciassd_jax.simulation.road_users import KINDS
 from ciassd_jax.types import Boxes

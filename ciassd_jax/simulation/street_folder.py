@@ -14,8 +14,8 @@ from jaxtyping import Float32, UInt8
 
 from ciassd_jax.data.kitti import FULL, IMAGE
 from ciassd_jax.formats.errors import InputError, Pathlike
-from ciassd_jax.formats.kitti import lidar_to_image, write_rows
-from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.kitti_camera import Camera, lidar_to_image
+from ciassd_jax.formats.kitti_rows import write_rows
 from ciassd_jax.formats.points import write_bin
 from ciassd_jax.formats.writing import check_folder, replacing, write_text
 from ciassd_jax.ops.camera import project

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from ciassd_jax.data.frames import Dataset, Frame
-from ciassd_jax.data.kitti import IGNORED, crop_to_view
-from ciassd_jax.formats.kitti import ObjectRow, rows_to_boxes
+from ciassd_jax.data.kitti import crop_to_view
+from ciassd_jax.formats.kitti_boxes import rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera
-from ciassd_jax.formats.kitti_difficulty import difficulty_of
+from ciassd_jax.formats.kitti_rows import DONT_CARE, ObjectRow, difficulty_of
 from ciassd_jax.simulation.casting import count_rays
 from ciassd_jax.simulation.label_rows import label_rows
 from ciassd_jax.simulation.layout import Objects, World, sample_world
@@ -101,7 +101,7 @@ def open_synthetic(seed: int, frames: int, lidar: Lidar | None = None) -> Datase
 def read_synthetic_frame(name: str, *, seed: int, lidar: Lidar) -> Frame:
     """Simulate the frame of that name, cropped to the camera's view as KITTI's frames are."""
     frame = make_frame(seed, int(name), lidar)
-    rows = [row for row in frame.rows if row.type != IGNORED]
+    rows = [row for row in frame.rows if row.type != DONT_CARE]
     difficulty = np.array([difficulty_of(row) for row in rows], np.int64)
     boxes = rows_to_boxes(rows, frame.camera.calibration)
     points = crop_to_view(frame.points, frame.camera)

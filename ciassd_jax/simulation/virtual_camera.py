@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ciassd_jax.formats.kitti import Calibration
-from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.kitti_camera import Calibration, Camera
 
 IMAGE_SIZE = (1242, 375)
 _FOCAL, _CENTER = 721.5377, (609.5593, 172.854)

@@ -1,4 +1,4 @@
-"""A camera's image with 3D boxes projected into it, drawn with matplotlib's objects: no window, no global state."""
+"""A camera's image with projected 3D boxes, drawn with matplotlib."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ciassd_jax.formats.kitti import Calibration, lidar_to_image
-from ciassd_jax.view.bev import FOUND, TRUTH, Picture, captions_of
+from ciassd_jax.formats.kitti_camera import Calibration, lidar_to_image
 from ciassd_jax.view.outlines import outline_boxes, project_segments, seen_in_image
+from ciassd_jax.view.picture import FOUND, TRUTH, captions_of, new_picture
 from ciassd_jax.view.sampling import usable_boxes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-# Pixels of the image per inch of the figure; the picture is saved with half as many again, for crisp lines.
+# Pixels of the image per inch of the figure; the picture is saved at 1.5 times this resolution, for crisp lines.
 _SCALE = 100
-# The places of a caption nearer than this to the upper border, in pixels, are inside the image instead.
+# Captions keep this distance from the upper border, in pixels, so that they stay inside the image.
 _CAPTION_HEIGHT = 16
 
 
@@ -31,15 +32,15 @@ def plot_overlay(
     labels: Sequence[str] | None = None,
     *,
     title: str | None = None,
-) -> Picture:
-    """The image with the ground truth in red and detections in green, with their scores, as the paper's Figure 5.
+) -> Figure:
+    """Return the image with the ground truth in red and detections in green with their scores, as the paper's Figure 5.
 
-    Boxes are x, y, z, length, width, height (metres), yaw in the LiDAR frame; each has a line along its bottom through
-    its front. Lines that pass the camera's plane are cut there; boxes outside the image, and such as
-    are not finite, are not drawn.
+    Boxes are x, y, z, length, width, height (metres), yaw in the LiDAR frame, each with a line along its bottom through
+    its front. Lines are clipped at the camera's plane. Boxes that are outside the image or not finite are not drawn.
+    Raises ModuleNotFoundError without matplotlib.
     """
     height, width = image.shape[:2]
-    figure = Picture(figsize=(width / _SCALE, height / _SCALE + 0.3 * bool(title)), dpi=1.5 * _SCALE)
+    figure = new_picture(figsize=(width / _SCALE, height / _SCALE + 0.3 * bool(title)), dpi=1.5 * _SCALE)
     axes = figure.add_axes((0, 0, 1, height / (_SCALE * figure.get_figheight())))
     axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest")
     axes.set(xlim=(0, width), ylim=(height, 0))
@@ -60,7 +61,7 @@ def _draw(
     color: str,
     texts: Sequence[str] | None,
 ) -> None:
-    """The visible lines of the boxes that the image shows, and a text above each."""
+    """The visible lines of the boxes that the image shows, and a caption above each."""
     from matplotlib.collections import LineCollection
 
     if boxes is None:

@@ -13,13 +13,15 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ciassd_jax.data.clouds import CloudFile, find_beside, find_clouds
-from ciassd_jax.data.custom import CustomRow, parse_custom_row, read_custom_rows
 from ciassd_jax.data.folders import is_custom, open_dataset
 from ciassd_jax.data.frames import clean_points
-from ciassd_jax.data.kitti import IGNORED, IMAGE, kitti_folder, read_objects
+from ciassd_jax.data.kitti import IMAGE, kitti_folder
+from ciassd_jax.formats.custom_rows import CustomRow, parse_custom_row, read_custom_rows
 from ciassd_jax.formats.errors import FormatWarning, InputError, read_bytes
-from ciassd_jax.formats.kitti import read_lines, read_rows, rows_to_boxes
+from ciassd_jax.formats.kitti_boxes import rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera
+from ciassd_jax.formats.kitti_rows import DONT_CARE, read_labels, read_rows
+from ciassd_jax.formats.lines import read_lines
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.view.view_frame import ViewFrame, frame_to_view
 
@@ -117,7 +119,7 @@ def _read_cloud(file: CloudFile) -> ViewFrame:
     if file.camera is None:
         warnings.warn(f"{path} is not shown, as {file.cloud} has no calibration.", FormatWarning, stacklevel=3)
         return frame
-    objects = read_objects(path)
+    objects = [row for row in read_labels(path) if row.type != DONT_CARE]
     boxes = np.asarray(rows_to_boxes(objects, file.camera.calibration).to_array())
     return frame._replace(truth=boxes, truth_labels=tuple(row.type for row in objects))
 
@@ -136,7 +138,7 @@ def _read_json(path: Path) -> _Saved:
 
 
 def _read_kitti(path: Path, camera: Camera) -> _Saved:
-    rows = [row for row in read_rows(path) if row.type != IGNORED]
+    rows = [row for row in read_rows(path) if row.type != DONT_CARE]
     if any(row.score is None for row in rows):
         raise InputError(f"{path} has rows without a score, so they are no detections; name the folder of results.")
     scores = np.array([row.score for row in rows], np.float64)

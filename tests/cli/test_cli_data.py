@@ -13,7 +13,7 @@ from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.gt_sampling import fingerprint_of, open_database
 from ciassd_jax.evaluation.check_scores import find_imperfect, score_truth
 from ciassd_jax.evaluation.dataset_check import check_dataset
-from ciassd_jax.formats.kitti import read_rows, write_rows
+from ciassd_jax.formats.kitti_rows import read_rows, write_rows
 from ciassd_jax.formats.points import write_bin
 from ciassd_jax.simulation import Lidar
 

@@ -15,7 +15,7 @@ from small import random_variables, share_programs, small_config
 from ciassd_jax import save_weights
 from ciassd_jax.cli import main
 from ciassd_jax.evaluation import evaluate, read_folders, to_json
-from ciassd_jax.formats.kitti import ObjectRow, write_rows
+from ciassd_jax.formats.kitti_rows import ObjectRow, write_rows
 
 
 @pytest.fixture

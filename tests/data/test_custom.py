@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from mini_folders import OBJECTS, full_cloud, object_boxes, write_custom
 
-from ciassd_jax.data.custom import read_custom_rows
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import difficulty_by_points
+from ciassd_jax.formats.custom_rows import read_custom_rows
 from ciassd_jax.formats.errors import FormatWarning, InputError
 
 

@@ -11,10 +11,11 @@ from small import CALIBRATION, IMAGE_SIZE
 
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import Frame
-from ciassd_jax.data.kitti import crop_to_view, read_objects, read_seen_points, write_reduced
+from ciassd_jax.data.kitti import crop_to_view, read_seen_points, write_reduced
 from ciassd_jax.formats.errors import FormatWarning, InputError
-from ciassd_jax.formats.kitti import ObjectRow, boxes_to_rows, lidar_to_image, rows_to_boxes
-from ciassd_jax.formats.kitti_camera import Camera, read_camera
+from ciassd_jax.formats.kitti_boxes import boxes_to_rows, rows_to_boxes
+from ciassd_jax.formats.kitti_camera import Camera, lidar_to_image, read_camera
+from ciassd_jax.formats.kitti_rows import DONT_CARE, ObjectRow, read_labels
 from ciassd_jax.formats.points import read_points, write_bin
 
 # A focal length of KITTI's, whose image is 1242 x 375.
@@ -125,7 +126,7 @@ def test_no_warning_of_images_where_nothing_is_cropped(tmp_path: Path) -> None:
 def test_an_unknown_camera_without_its_image_is_refused(tmp_path: Path) -> None:
     root = write_kitti(tmp_path, clouds="velodyne_reduced")
     (root / "training/image_2/000000.png").unlink()
-    with pytest.raises(InputError, match=r"calib/000000\.txt has a focal length of 300 pixels, .* --image-size"):
+    with pytest.raises(InputError, match=r"calib/000000\.txt has a focal length of 300 pixels, .* `image_size`"):
         read_first(root)
 
 
@@ -159,7 +160,7 @@ def test_intensities_of_0_to_255_are_divided(tmp_path: Path) -> None:
             lambda data: data.replace(b"Car 0.0000", b"Car nan"),
             r"line 1: a value is not finite; write",
         ),
-        ("image_2/000000.png", lambda data: data[:9], r"image_2/000000\.png is no PNG image; give"),
+        ("image_2/000000.png", lambda data: data[:9], r"image_2/000000\.png is not a PNG image; give"),
     ],
 )
 def test_a_file_that_cannot_be_used_gets_one_sentence(tmp_path: Path, file: str, damage, message: str) -> None:
@@ -192,7 +193,7 @@ def test_labels_return_from_the_lidar_frame_to_the_image(shared: Path) -> None:
     folder, count = shared / "kitti/training", 0
     for path in sorted((folder / "label_2").glob("*.txt")):
         camera = read_camera(folder / "calib" / path.name)
-        rows = read_objects(path)
+        rows = [row for row in read_labels(path) if row.type != DONT_CARE]
         boxes = rows_to_boxes(rows, camera.calibration)
         again, kept = boxes_to_rows(boxes, np.zeros(len(rows)), [row.type for row in rows], *camera)
         assert kept.tolist() == list(range(len(rows)))
@@ -239,5 +240,5 @@ def test_every_frame_of_the_reference_data_reads(shared: Path) -> None:
 def test_a_cloud_that_vanishes_after_opening_is_named(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
     camera = read_camera(root / "training/calib/000000.txt", image_size=IMAGE_SIZE)
-    with pytest.raises(InputError, match=r"velodyne/000009\.bin does not exist; copy it, or take the frame off"):
+    with pytest.raises(InputError, match=r"velodyne/000009\.bin does not exist; copy it, or remove the frame from"):
         read_seen_points(root / "training", "000009", camera)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import shapely
 
-from ciassd_jax.formats.kitti import ObjectRow
+from ciassd_jax.formats.kitti_rows import ObjectRow
 
 LEVELS = ((40, 0, 0.15), (25, 1, 0.30), (25, 2, 0.50))
 NEIGHBOURS = {"car": "van", "pedestrian": "person_sitting"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ciassd_jax.evaluation import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
-from ciassd_jax.formats.kitti import ObjectRow
+from ciassd_jax.formats.kitti_rows import ObjectRow
 
 Frames = list[tuple[list[ObjectRow], list[ObjectRow]]]
 NAMES = ["Car", "car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck", "DontCare"]

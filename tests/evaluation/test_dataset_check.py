@@ -13,7 +13,7 @@ from ciassd_jax import car, tiny
 from ciassd_jax.evaluation.dataset_check import check_dataset
 from ciassd_jax.evaluation.findings import Finding, Report
 from ciassd_jax.formats.errors import InputError
-from ciassd_jax.formats.kitti import read_rows, write_rows
+from ciassd_jax.formats.kitti_rows import read_rows, write_rows
 from ciassd_jax.formats.points import write_bin
 
 Damage = Callable[[Path], object]

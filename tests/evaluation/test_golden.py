@@ -8,8 +8,7 @@ import pytest
 
 from ciassd_jax.evaluation.kitti_ap import Curve, Evaluand, average_precision, is_evaluated, prepare, trace_curve
 from ciassd_jax.evaluation.objects import detections_from_rows, labels_from_rows
-from ciassd_jax.formats.kitti import read_rows
-from ciassd_jax.formats.kitti_results import read_results
+from ciassd_jax.formats.kitti_rows import read_results, read_rows
 
 pytestmark = pytest.mark.reference
 

@@ -7,7 +7,7 @@ from scenes import Frames, found, label, random_frames, records
 
 from ciassd_jax.evaluation import evaluate
 from ciassd_jax.evaluation.kitti_ap import LIMITS, Curve, prepare, trace_curve
-from ciassd_jax.formats.kitti import ObjectRow
+from ciassd_jax.formats.kitti_rows import ObjectRow
 
 
 def curve_of(

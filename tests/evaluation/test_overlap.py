@@ -7,7 +7,7 @@ from scenes import found, label, random_frames
 
 from ciassd_jax.evaluation.objects import detections_from_rows, flatten, labels_from_rows
 from ciassd_jax.evaluation.overlap import Intersections, intersect
-from ciassd_jax.formats.kitti import ObjectRow
+from ciassd_jax.formats.kitti_rows import ObjectRow
 
 
 def one_pair(first: ObjectRow, second: ObjectRow, geometry: str) -> Intersections:

@@ -8,7 +8,7 @@ from scenes import found, label
 
 from ciassd_jax.evaluation import evaluate, read_folders
 from ciassd_jax.formats.errors import FormatWarning, InputError
-from ciassd_jax.formats.kitti import format_row, write_rows
+from ciassd_jax.formats.kitti_rows import format_row, write_rows
 
 
 @pytest.fixture

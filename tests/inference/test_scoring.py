@@ -17,7 +17,7 @@ from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.evaluation import Evaluation, evaluate, read_folders, to_json
 from ciassd_jax.formats.errors import DroppedWarning, FormatWarning, InputError
-from ciassd_jax.formats.kitti import parse_row
+from ciassd_jax.formats.kitti_rows import parse_row
 from ciassd_jax.formats.points import read_points, write_bin
 from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.inference.scoring import detect_dataset, find_trained, score_dataset, score_frames, write_frames

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ciassd_jax.formats.kitti import image_size_for, lidar_to_image, read_calibration
+from ciassd_jax.formats.kitti_camera import image_size_for, lidar_to_image, read_calibration
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.ops.camera import clip_to_depth, frustum_planes, inside_planes, project
 

@@ -13,7 +13,8 @@ from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.scenes import pad_frame
 from ciassd_jax.evaluation.dataset_check import check_dataset
 from ciassd_jax.formats.errors import InputError
-from ciassd_jax.formats.kitti import read_calibration, read_rows
+from ciassd_jax.formats.kitti_camera import read_calibration
+from ciassd_jax.formats.kitti_rows import read_rows
 from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.simulation import Lidar, frame_key, make_frame, open_synthetic, simulate, write_synthetic
 from ciassd_jax.simulation.casting import Hits, Rays, cast

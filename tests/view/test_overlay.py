@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from small import CALIBRATION, IMAGE_SIZE
 
 from ciassd_jax.data.kitti import read_kitti_frame
-from ciassd_jax.formats.kitti import Calibration, lidar_to_image, read_calibration, read_rows
-from ciassd_jax.view.bev import FOUND, TRUTH
+from ciassd_jax.formats.kitti_camera import Calibration, lidar_to_image, read_calibration
+from ciassd_jax.formats.kitti_rows import read_rows
 from ciassd_jax.view.outlines import outline_boxes, project_segments
 from ciassd_jax.view.overlay import plot_overlay
+from ciassd_jax.view.picture import FOUND, TRUTH
 from ciassd_jax.view.sources import read_image
 
 WIDTH, HEIGHT = IMAGE_SIZE
