@@ -45,9 +45,11 @@ class View:
 
     def run(self) -> int:
         from ciassd_jax.formats.writing import check_folder
+        from ciassd_jax.view.html import view_html
+        from ciassd_jax.view.viz_extra import require
 
         try:
-            from ciassd_jax.view.html import view_html
+            require("Pages", "plotly", "PIL")
         except ModuleNotFoundError as error:
             raise UsageError(str(error)) from error
         self._check()

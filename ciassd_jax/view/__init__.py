@@ -1,4 +1,5 @@
-"""Pictures of scenes and detections: `bev` and `overlay` (matplotlib figures), `html` (one page in 3D).
+"""Views of point clouds and boxes: `bev` and `overlay` draw matplotlib figures, `html` writes one page in 3D.
 
-`frames` has the record that a page shows and makes it from frames, scenes and results; `sources` reads it from files.
+`view_frame` holds the record that a page shows and builds it from frames and scenes; `sources` reads it from files.
+The libraries of the extra `viz` are imported when a function needs them.
 """

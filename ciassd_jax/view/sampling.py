@@ -1,4 +1,4 @@
-"""Which points and boxes of a frame can be shown, and one sentence for each reason to leave some out."""
+"""Which points and boxes of a frame can be shown, with one sentence for each reason to leave some out."""
 
 from __future__ import annotations
 
@@ -7,19 +7,26 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-# Farther from the sensor, in metres along an axis, lie only stray numbers that would make the scene a speck.
+# Coordinates in metres beyond this are stray values, which would shrink the scene to a speck.
 FARTHEST = 300.0
 
 
 class ShownPoints(NamedTuple):
-    """The points x, y, z that are shown, and what was left out."""
+    """The points (x, y, z) that are shown, and notes on what is left out."""
 
     points: Float[np.ndarray, "M 3"]
     notes: tuple[str, ...]
 
 
+class ShownBoxes(NamedTuple):
+    """The indices of the boxes that are shown, and notes on what is left out."""
+
+    indices: Int[np.ndarray, " M"]
+    notes: tuple[str, ...]
+
+
 def choose_points(points: Float[np.ndarray, "N columns"], most: int) -> ShownPoints:
-    """At most so many points: those that are finite and within `FARTHEST`, evenly thinned; always the same ones."""
+    """Choose at most `most` points that are finite and within `FARTHEST`, sampled evenly and deterministically."""
     places, given = points[:, :3], len(points)
     finite = np.isfinite(places).all(1)
     near = (np.abs(places) <= FARTHEST).all(1)
@@ -35,15 +42,25 @@ def choose_points(points: Float[np.ndarray, "N columns"], most: int) -> ShownPoi
     return ShownPoints(places[chosen], tuple(notes))
 
 
+def choose_boxes(
+    boxes: Float[np.ndarray, "D 7"], what: str, scores: Float[np.ndarray, " D"] | None = None
+) -> ShownBoxes:
+    """Choose the usable boxes, with finite scores if scores are given; `what` names the boxes in the note."""
+    chosen = np.flatnonzero(usable_boxes(boxes) & (True if scores is None else np.isfinite(scores)))
+    lost = len(boxes) - len(chosen)
+    notes = (f"{lost} of {len(boxes)} {what} are not finite or too far and not shown.",) if lost else ()
+    return ShownBoxes(chosen, notes)
+
+
 def thin(count: int, most: int) -> Int[np.ndarray, " most"]:
-    """One index out of each of `most` equal parts of range(count), always the same ones."""
+    """Return one index from each of `most` equal parts of range(count), the same ones in every call."""
     borders = np.arange(most + 1) * count // most
-    # Not the first of each part: a fixed stride through an organised cloud would leave out whole rings of it.
+    # A random index of each part: a fixed stride through an organised cloud would leave out whole rings.
     place = np.random.default_rng(0).random(most)
     return borders[:-1] + (place * np.diff(borders)).astype(np.int64)
 
 
 def usable_boxes(boxes: Float[np.ndarray, "D 7"]) -> Bool[np.ndarray, " D"]:
-    """Whether each box has finite numbers and lies within `FARTHEST`, itself no larger."""
+    """Return whether each box is finite, with coordinates and sizes of at most `FARTHEST`."""
     # Comparisons with NaN are false.
     return (np.abs(boxes[:, :6]) <= FARTHEST).all(1) & np.isfinite(boxes[:, 6])

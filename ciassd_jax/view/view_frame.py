@@ -1,4 +1,4 @@
-"""What a page shows of a frame, and how it is made from frames, scenes and the detector's results."""
+"""The record that a page shows, and how to build it from frames and scenes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ NO_BOXES = np.zeros((0, 7))
 
 
 class ViewFrame(NamedTuple):
-    """A frame to look at: N points, D detected boxes and G boxes of the ground truth, in the LiDAR frame.
+    """A frame to view: N points, D detected boxes and G boxes of the ground truth, in the LiDAR frame.
 
-    `points` hold x, y, z (metres) first; boxes are x, y, z, length, width, height, yaw. `scores` are None for boxes
-    that have none, labels may be left out. `image` is shown where there is also a `camera` to project boxes with.
+    The first columns of `points` are x, y, z (metres); boxes are x, y, z, length, width, height, yaw. `scores` are None
+    for boxes without scores, and labels may be empty. `image` is shown only with a `camera` that projects the boxes.
     """
 
     name: str
@@ -35,13 +35,16 @@ class ViewFrame(NamedTuple):
 
 
 def frame_to_view(frame: Frame, image: UInt8[np.ndarray, "rows columns 3"] | None = None) -> ViewFrame:
-    """A labelled frame of a data set, its objects as the ground truth."""
+    """Return the view of a labelled frame, with its objects as the ground truth."""
     truth = np.asarray(frame.boxes.to_array())
     return ViewFrame(frame.name, frame.points, truth=truth, truth_labels=frame.names, camera=frame.camera, image=image)
 
 
 def scene_to_view(scene: Scene, class_names: Sequence[str]) -> list[ViewFrame]:
-    """A scene as training sees it, or each scene of a batch; without padding, and obstacles labelled "other"."""
+    """Return the view of a training scene, or of each scene of a batch.
+
+    Padding is left out. Obstacles, whose label is negative, are named "other".
+    """
     if np.ndim(scene.frame) == 0:
         scene = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)
     frames = []

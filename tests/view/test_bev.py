@@ -9,7 +9,8 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from ciassd_jax.view.bev import FOUND, TRUTH, plot_bev
+from ciassd_jax.view.bev import plot_bev
+from ciassd_jax.view.picture import FOUND, TRUTH
 
 POINTS = np.random.default_rng(0).uniform([0, -10, -2, 0], [30, 10, 1, 1], (500, 4)).astype(np.float32)
 BOXES = np.array([[10, 2, -1, 4, 2, 1.5, 0], [20, -3, -1, 4, 2, 1.5, np.pi / 2]], np.float32)
@@ -98,6 +99,12 @@ def test_a_notebook_shows_the_picture() -> None:
 
 
 def test_no_pyplot_and_nothing_drawn_on_import() -> None:
-    code = "import sys, ciassd_jax; assert 'matplotlib' not in sys.modules; import ciassd_jax.view.bev; "
-    code += "assert 'matplotlib.pyplot' not in sys.modules"
+    code = "import sys, numpy, ciassd_jax.view.bev, ciassd_jax.view.overlay; assert 'matplotlib' not in sys.modules; "
+    code += "ciassd_jax.view.bev.plot_bev(numpy.zeros((1, 4))); assert 'matplotlib.pyplot' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_without_matplotlib_one_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ModuleNotFoundError, match=r"matplotlib.*pip install 'ciassd_jax\[viz\]'"):
+        plot_bev(POINTS)
