@@ -1,9 +1,9 @@
-"""Do synthetic scenes look like KITTI's? A table and a plot of what a detector would see of both.
+"""Do simulated scenes look like KITTI's? A table and a plot of what a detector sees of both.
 
     python experiments/compare_synthetic.py --real ../shared/kitti --frames 155 --out experiments
 
-Points per frame and per ring of distance, occupied voxels and active sites of every stage of `car()`, what a car looks
-like at a distance, sizes, headings, occlusion, reflectance. Writes OUT/synthetic_vs_real.md and .png. Results:
+Compares points per frame and ring of distance, occupied voxels and active sites of each stage of `car()`, points per
+car by distance, sizes, headings, difficulty and reflectance. Writes OUT/synthetic_vs_real.md and .png. Results:
 README.md.
 """
 
@@ -26,13 +26,13 @@ from ciassd_jax.simulation import open_synthetic
 
 RINGS = np.arange(0, 80, 10)
 LEVELS = ("easy", "moderate", "hard", "none")
-# Ground within this height of where the wheels stand, and so far away, is what its reflectance is taken from.
+# Points within this height of the road and this distance count as ground, both in metres.
 GROUND, GROUND_RANGE = 0.15, 25.0
 BINS = np.linspace(0, 1, 21)
 
 
 class Look(NamedTuple):
-    """What is counted of a data set: one row for every frame or car."""
+    """The counts of a data set, one row per frame or car."""
 
     points: np.ndarray
     rings: np.ndarray
@@ -48,7 +48,7 @@ class Look(NamedTuple):
 
 
 def look_at(frames: Iterable[Frame]) -> Look:
-    """Count."""
+    """Count over the frames."""
     rows: dict[str, list] = {name: [] for name in Look._fields}
     difficulty, types = Counter(), Counter()
     for frame in frames:
@@ -79,7 +79,7 @@ def look_at(frames: Iterable[Frame]) -> Look:
 
 
 def count_sites(points: np.ndarray) -> list[int]:
-    """Occupied voxels of `car()`, then active sites after each strided stage and after the last convolution."""
+    """Return the occupied voxels of `car()` and the active sites after each strided stage and the last convolution."""
     config = car()
     low, size = np.array(config.grid.minimum, np.float32), np.array(config.grid.voxel_size, np.float32)
     sites = np.unique(np.floor((points[:, :3] - low) / size).astype(np.int64)[:, ::-1], axis=0)
@@ -91,7 +91,7 @@ def count_sites(points: np.ndarray) -> list[int]:
 
 
 def strided(sites: np.ndarray, kernel: tuple, stride: tuple, padding: tuple, shape: tuple) -> np.ndarray:
-    """Output sites that have any of these in their window."""
+    """Return the output sites whose window holds any of these sites."""
     found = []
     for offset in np.ndindex(*kernel):
         start = sites + np.array(padding) - np.array(offset)
@@ -102,7 +102,7 @@ def strided(sites: np.ndarray, kernel: tuple, stride: tuple, padding: tuple, sha
 
 
 def table(real: Look, synthetic: Look) -> list[str]:
-    """Rows of Markdown."""
+    """Return the comparison as a Markdown table."""
     rows = ["| | real | synthetic |", "|---|---|---|"]
 
     def add(name: str, measure) -> None:  # type: ignore[no-untyped-def]
@@ -166,7 +166,7 @@ def _reflectance(values: np.ndarray) -> str:
 
 
 def plot(looks: dict[str, Look]) -> Figure:
-    """Points by distance, points of cars, reflectances, heights."""
+    """Plot points by distance, sites, points of cars, reflectances and heights."""
     figure = Figure(figsize=(13, 7.5), dpi=130, layout="constrained")
     axes = figure.subplots(2, 3).ravel()
     for (name, look), color in zip(looks.items(), ("#d62728", "#1f6fb4"), strict=True):

@@ -1,23 +1,23 @@
-"""Figure 4: confidence against real overlap, before and after its rectification.
+"""Figure 4: confidence against the true overlap, before and after rectification.
 
     python experiments/run.py figure4_iou_scatter --data KITTI --weights cia_ssd.pth
 
-A point is a decoded box above the score threshold, before NMS; its overlap is the 3D IoU with the nearest object.
+Each point is a decoded box above the score threshold, before NMS. Its overlap is the 3D IoU with the nearest object.
 Results: README.md.
 """
 
 from __future__ import annotations
 
+from experiment_report import Report
 from measuring import decode_all
 from plots import plot_scatter
-from report import Report
 from study import Study
 
 from ciassd_jax.evaluation.breakdown import pearson
 
 
 def run(study: Study) -> Report:
-    """Correlations of three quantities with the overlap; the first seed's boxes as a plot."""
+    """Correlate three quantities with the overlap; plot the boxes of the first seed."""
     config, dataset = study.config, study.validation()
     decoded = [decode_all(variables, config, dataset) for variables in study.networks("full", config)]
     exponent = config.detection.iou_exponent

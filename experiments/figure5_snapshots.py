@@ -1,15 +1,15 @@
-"""Figure 5: what is found, in the camera's image and from above; truth red, detections green.
+"""Figure 5: detections in the camera's image and from above; truth red, detections green.
 
     python experiments/run.py figure5_snapshots --data KITTI --weights cia_ssd.pth
 
-Six frames, evenly spread over val. Frames without an image are drawn from above only. Results: README.md.
+Six frames, evenly spaced over val. Frames without an image are drawn from above only. Results: README.md.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from experiment_report import Report
 from measuring import nearest_overlap, target_boxes
-from report import Report
 from study import Study
 
 from ciassd_jax import Boxes, Detector
@@ -40,5 +40,5 @@ def run(study: Study) -> Report:
         source = read_source(sources[frame.name], image=True) if frame.name in sources else None
         if source is not None and source.image is not None and frame.camera is not None:
             figures[f"{frame.name}_image"] = plot_overlay(source.image, frame.camera.calibration, *boxes)
-    notes = (f"A car is found where its nearest detection overlaps it by {MATCHED} in 3D or more.",)
+    notes = (f"A car is found if the 3D IoU with its nearest detection is at least {MATCHED}.",)
     return Report("Figure 5: snapshots", rows, notes, figures)

@@ -1,11 +1,10 @@
-"""Accuracy of many ways of post-processing from one pass of a network over the frames."""
+"""Accuracy of several settings of the post-processing from one pass of the network over the frames."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,15 +29,14 @@ from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.ops.iou import iou_3d
 from ciassd_jax.types import Candidates, PointCloud, Predictions, Variables
 
-_predict_raw = jax.jit(predict_raw, static_argnames="config")
-_postprocess = jax.jit(postprocess, static_argnames="config")
+_predict_raw = jax.jit(predict_raw)
+_postprocess = jax.jit(postprocess)
 
 
 class DecodedBoxes(NamedTuple):
-    """Every decoded box of all frames whose class probability reaches the threshold, before any suppression.
+    """The decoded boxes of all frames whose class probability reaches the threshold, before NMS.
 
-    `overlap` is its 3D IoU with the object whose centre is nearest in the plane; boxes of frames without an object
-    are left out.
+    `overlap` is the 3D IoU with the object whose centre is nearest in the plane. Frames without objects are skipped.
     """
 
     probability: np.ndarray
@@ -46,12 +44,12 @@ class DecodedBoxes(NamedTuple):
     overlap: np.ndarray
 
     def confidence(self, exponent: float) -> np.ndarray:
-        """The rectified confidence, c * iou ** exponent (paper equation 6)."""
+        """Return the rectified confidence c * iou ** exponent (paper equation 6)."""
         return self.probability * np.abs(self.predicted_iou) ** exponent
 
 
-class Seen(NamedTuple):
-    """A frame with its labels, its padded cloud and what the network says of it."""
+class Predicted(NamedTuple):
+    """A frame with its labels, its padded cloud and the network's raw predictions."""
 
     frame: Frame
     truth: LabelledObjects
@@ -62,56 +60,56 @@ class Seen(NamedTuple):
 def score_settings(
     variables: Variables, config: Config, settings: Mapping[str, DetectionConfig], dataset: Dataset
 ) -> dict[str, Evaluation]:
-    """The evaluation of every setting of the post-processing; all are given the same raw predictions."""
-    return _evaluate([_score(seen, config, settings) for seen in _predictions(variables, config, dataset)])
+    """Evaluate each setting of the post-processing on the same raw predictions."""
+    return _evaluate([_score(one, config, settings) for one in _predictions(variables, config, dataset)])
 
 
 def decode_all(variables: Variables, config: Config, dataset: Dataset) -> DecodedBoxes:
-    """Every decoded box above the score threshold, however many."""
-    return _join([_decode(seen, config) for seen in _predictions(variables, config, dataset)])
+    """Return all decoded boxes above the score threshold, without a limit on their number."""
+    return _join([_decode(one, config) for one in _predictions(variables, config, dataset)])
 
 
 def score_and_decode(
     variables: Variables, config: Config, settings: Mapping[str, DetectionConfig], dataset: Dataset
 ) -> tuple[dict[str, Evaluation], DecodedBoxes]:
-    """What `score_settings` and `decode_all` give, from one pass of the network."""
+    """Return the results of `score_settings` and `decode_all` from one pass of the network."""
     scored, decoded = [], []
-    for seen in _predictions(variables, config, dataset):
-        scored.append(_score(seen, config, settings))
-        decoded.append(_decode(seen, config))
+    for one in _predictions(variables, config, dataset):
+        scored.append(_score(one, config, settings))
+        decoded.append(_decode(one, config))
     return _evaluate(scored), _join(decoded)
 
 
-def _predictions(variables: Variables, config: Config, dataset: Dataset) -> Iterator[Seen]:
-    config, variables = without_training(config), jax.device_put(variables)
+def _predictions(variables: Variables, config: Config, dataset: Dataset) -> Iterator[Predicted]:
+    config, variables = config.for_inference(), jax.device_put(variables)
 
     def track(names: Sequence[str]) -> Iterable[str]:
         return tqdm(names, unit="frame", leave=False, disable=None)
 
     for frame, truth in labelled_frames(dataset, track):
         cloud = pad_to_bucket(frame.points)
-        yield Seen(frame, truth, cloud, _predict_raw(variables, cloud, config))
+        yield Predicted(frame, truth, cloud, _predict_raw(variables, cloud, config))
 
 
-def _score(seen: Seen, config: Config, settings: Mapping[str, DetectionConfig]) -> dict[str, ScoredFrame]:
-    config = without_training(config)
-    planes = ANYWHERE if seen.frame.camera is None else view_planes(seen.frame.camera)
+def _score(one: Predicted, config: Config, settings: Mapping[str, DetectionConfig]) -> dict[str, ScoredFrame]:
+    config = config.for_inference()
+    planes = ANYWHERE if one.frame.camera is None else view_planes(one.frame.camera)
     scored = {}
     for name, setting in settings.items():
-        batch = _postprocess(seen.raw, seen.cloud, replace(config, detection=setting), frustum=planes[None])
-        scored[name] = score_frame(seen.frame, seen.truth, frame_result(batch, config, 0.0))
+        batch = _postprocess(one.raw, one.cloud, replace(config, detection=setting), frustum=planes[None])
+        scored[name] = score_frame(one.frame, one.truth, frame_result(batch, config, 0.0))
     return scored
 
 
 def _evaluate(frames: Sequence[Mapping[str, ScoredFrame]]) -> dict[str, Evaluation]:
     scored = {name: [frame[name] for frame in frames] for name in frames[0]}
-    # Most settings lose the same.
+    # Most settings drop the same: warn once.
     for dropped in sorted({describe_dropped(of_setting) for of_setting in scored.values()} - {""}):
         warnings.warn(dropped, DroppedWarning, stacklevel=3)
     return {name: score_frames(of_setting) for name, of_setting in scored.items()}
 
 
-@partial(jax.jit, static_argnames="config")
+@jax.jit
 def _candidates(predictions: Predictions, config: Config) -> Candidates:
     anchors, labels = make_anchors(config)
     every = replace(config.detection, iou_exponent=0.0, max_candidates=len(labels))
@@ -119,10 +117,9 @@ def _candidates(predictions: Predictions, config: Config) -> Candidates:
     return select_candidates(scene, anchors, labels, every)[0]
 
 
-def _decode(seen: Seen, config: Config) -> DecodedBoxes:
-    found: Any = jax.device_get(_candidates(seen.raw.predictions, without_training(config)))
-    truth = target_boxes(seen.frame, config)
-    # Without an object there is nothing to overlap with.
+def _decode(one: Predicted, config: Config) -> DecodedBoxes:
+    found: Any = jax.device_get(_candidates(one.raw.predictions, config.for_inference()))
+    truth = target_boxes(one.frame, config)
     found = jax.tree.map(lambda leaf: leaf[found.valid & (len(truth.yaw) > 0)].astype(np.float64), found)
     overlap = nearest_overlap(found.boxes, truth) if len(found.score) else np.zeros(0)
     return DecodedBoxes(found.score, found.iou, overlap)
@@ -132,20 +129,14 @@ def _join(parts: Sequence[DecodedBoxes]) -> DecodedBoxes:
     return DecodedBoxes(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def without_training(config: Config) -> Config:
-    """The config without what only training reads, so that all networks of one shape share their programs."""
-    plain = Config()
-    return replace(config, data=plain.data, loss=plain.loss, schedule=plain.schedule)
-
-
 def target_boxes(frame: Frame, config: Config) -> Boxes:
-    """The objects of a frame that the config's classes stand for."""
+    """Return the objects of a frame that are targets of the config's classes."""
     wanted = target_labels(frame, config) >= 0
     return Boxes(*(leaf[wanted] for leaf in frame.boxes))
 
 
 def nearest_overlap(boxes: Boxes, truth: Boxes) -> np.ndarray:
-    """3D IoU of each box with the true one whose centre is nearest in the plane."""
+    """Return the 3D IoU of each box with the true box whose centre is nearest in the plane."""
     apart = np.linalg.norm(boxes.center[:, None, :2] - truth.center[None, :, :2], axis=-1)
     nearest = apart.argmin(1)
     return np.asarray(iou_3d(boxes, Boxes(*(leaf[nearest] for leaf in truth))))
@@ -168,5 +159,5 @@ def precisions(evaluations: Sequence[Evaluation], name: str = "Car") -> dict[str
 
 
 def is_too_small(rows: Sequence[Mapping[str, Any]], column: str = "3D R40 moderate") -> bool:
-    """Whether no row reaches an AP of 1 % on average over the seeds: nothing was learnt that could be compared."""
+    """Return whether no row reaches an AP of 1 % on average over the seeds, too little to compare."""
     return all(sum(row[column]) < len(row[column]) for row in rows)

@@ -1,9 +1,9 @@
-"""The paper's claim on memory: SSFA takes 10 % more than SECOND's neck, SA-SSD's module 27 % more.
+"""The memory of the necks: in the paper, SSFA needs 10 % more than SECOND's neck and SA-SSD's module 27 % more.
 
     python experiments/run.py memory_of_necks --preset car
 
-From the compiled programs, of `predict` for one cloud and of one training step: what the compiler sets aside for
-temporaries, weights and batch. No data is needed, nothing runs. Results: README.md.
+The memory that the compiler reserves for temporaries, weights and batch, for `predict` on one cloud and for a training
+step of one scene. Needs no data; the programs are compiled but not run. Results: README.md.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from experiment_report import Report
 from plots import plot_bars
-from report import Report
 from study import Study, with_neck
 
 from ciassd_jax import Boxes, Config, GroundTruth, PointCloud, Scene, create_train_state, train_step
@@ -44,12 +44,12 @@ def run(study: Study) -> Report:
     for name in ("predict", "training step"):
         for row in rows:
             row[f"{name} more"] = f"{100 * (row[f'{name}, MB'] / rows[0][f'{name}, MB'] - 1):+.0f} %"
-    notes = (f"A training step of one scene. Compiled for {jax.default_backend()}: other devices lay out otherwise.",)
+    notes = (f"A training step of one scene. Compiled for {jax.default_backend()}; other devices need other amounts.",)
     return Report("Memory of the necks", rows, notes, {"": plot_bars(rows, "training step, MB")})
 
 
 def training_memory(config: Config) -> int:
-    """Bytes of one compiled training step of one scene."""
+    """Return the bytes of a compiled training step of one scene."""
     state = jax.eval_shape(partial(create_train_state, config=config), jax.random.key(0))
     points, boxes = config.data.max_points, config.data.max_boxes
 
@@ -59,6 +59,5 @@ def training_memory(config: Config) -> int:
         labels = GroundTruth(truth, jnp.zeros((1, boxes), jnp.int32), none)
         return Scene(PointCloud(jnp.zeros((1, points, 4)), none), labels, *[none] * (len(Scene._fields) - 2))
 
-    step = jax.jit(train_step, static_argnames="config")
-    memory: Any = step.lower(state, jax.eval_shape(scene), config).compile().memory_analysis()
+    memory: Any = jax.jit(train_step).lower(state, jax.eval_shape(scene), config).compile().memory_analysis()
     return memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes

@@ -1,9 +1,9 @@
-"""Four real frames learnt by heart: every car of moderate difficulty should be found at a 3D overlap of 0.7.
+"""Overfit four real frames: every car of moderate difficulty should be found at a 3D IoU of 0.7.
 
     python experiments/overfit_four_frames.py --data ../shared/kitti --workdir /tmp/overfit
 
-A check that targets, losses, optimiser and detection belong together; exit code 1 where a car is missed. Nothing is
-augmented. `tests/test_overfit.py` does the same in small. Results: README.md.
+Checks that targets, losses, optimiser and detection fit together, without augmentation. The exit code is 1 if a car is
+missed. `tests/training/test_overfit.py` is a small version. Results: README.md.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MODERATE = 1
 
 
 def main() -> int:
-    """Train on the four frames and count what is found."""
+    """Train on the four frames and count the cars that are found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--workdir", type=Path, required=True)
@@ -39,7 +39,7 @@ def main() -> int:
     print(f"{options.steps} steps in {time.perf_counter() - start:.0f} s")
     for name, hardest in (("moderate", MODERATE), ("any", None)):
         found, targets = count_found(state, dataset, config, hardest=hardest)
-        print(f"{found} of {targets} cars of {name} difficulty are found at a 3D overlap of 0.7")
+        print(f"{found} of {targets} cars of {name} difficulty are found at a 3D IoU of 0.7")
         if hardest == MODERATE:
             missed = targets - found
     return int(missed > 0)

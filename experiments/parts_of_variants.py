@@ -1,8 +1,8 @@
-"""What each switch changes of the network: parameters, arithmetic, and which parts stay the same.
+"""What each switch changes in the network: parameters, FLOPs and parameter trees.
 
     python experiments/run.py parts_of_variants --preset car
 
-No data is needed, nothing runs. Results: README.md.
+Needs no data and runs nothing. Results: README.md.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from functools import partial
 from typing import Any
 
 import jax
+from experiment_report import Report
 from plots import plot_bars
-from report import Report
 from study import Study, with_detection, with_neck, without_iou
 from table3_data import ROWS, with_switches
 
@@ -22,7 +22,7 @@ from ciassd_jax.inference.cost import PARTS, count_flops, count_parameters
 
 
 def run(study: Study) -> Report:
-    """One row for each variant of the config."""
+    """Make one row per variant of the config."""
     config = study.config
     nothing = dict.fromkeys(filter(None, ROWS.values()), False)
     variants = {
@@ -43,13 +43,13 @@ def run(study: Study) -> Report:
         row["other parameter trees"] = ", ".join(part for part in PARTS if trees[part] != whole[part]) or "none"
         rows.append(row)
     notes = (
-        "GFLOP of one scene's convolutions, the backbone at full capacity. SA-SSD's neck gives twice the channels, and "
-        "the head's kernels follow.",
+        "GFLOP of the convolutions of one scene, the backbone at full capacity. SA-SSD's neck has twice the output "
+        "channels, which changes the head's kernels.",
     )
     return Report("What each switch changes", rows, notes, {"": plot_bars(rows, "neck, GFLOP")})
 
 
 def trees_of(config: Config) -> dict[str, Any]:
-    """Names and shapes of the parameters of every part."""
+    """Return the names, shapes and types of the parameters of each part."""
     params: Any = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))["params"]
     return {part: jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), params[part]) for part in PARTS}

@@ -1,4 +1,4 @@
-"""The plots of the experiments, drawn with matplotlib's objects."""
+"""The plots of the experiments."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BLUE, ORANGE, GREY = "#3f6aa8", "#d9822b", "#8a8a86"
 
 
 def plot_bars(rows: Sequence[Mapping[str, Any]], column: str) -> Figure:
-    """One column of a table as bars: the mean, and a line over the range where there are several values."""
+    """Draw one column of a table as bars: the mean, and a line over the range of several values."""
     names = [str(next(iter(row.values()))) for row in rows]
     values = [np.atleast_1d(np.asarray(row[column], float)) for row in rows]
     means = np.array([value.mean() for value in values])
@@ -27,14 +27,14 @@ def plot_bars(rows: Sequence[Mapping[str, Any]], column: str) -> Figure:
     axes.set_yticks(places, names)
     axes.set_xlabel(column)
     axes.margins(x=0.12)
-    # Bars of no length at all need an axis too.
+    # Give the axis a length if all bars are zero.
     axes.set_xlim(0, None if means.any() else 1)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 
 
 def plot_beta(rows: Sequence[Mapping[str, Any]], column: str) -> Figure:
-    """Accuracy and correlation against beta, a faint line for each seed."""
+    """Draw accuracy and correlation against beta, with a faint line for each seed."""
     figure = Figure(figsize=(7, 4), dpi=130, layout="constrained")
     left = figure.subplots()
     right = left.twinx()
@@ -51,9 +51,9 @@ def plot_beta(rows: Sequence[Mapping[str, Any]], column: str) -> Figure:
 
 
 def plot_scatter(quantities: Mapping[str, np.ndarray], overlap: np.ndarray) -> Figure:
-    """A panel for each quantity: its value against the overlap of the same box."""
+    """Draw one panel per quantity: its value against the overlap of the same box."""
     figure = Figure(figsize=(4.2 * len(quantities), 4.2), dpi=130, layout="constrained")
-    # Dense clouds of thousands of points must not become one patch.
+    # Keep thousands of points distinguishable.
     alpha = float(np.clip(400 / max(len(overlap), 1), 0.1, 0.7))
     for axes, (title, values) in zip(figure.subplots(1, len(quantities), sharey=True), quantities.items(), strict=True):
         axes.plot([0, 1], [0, 1], color=GREY, linewidth=0.8)

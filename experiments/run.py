@@ -1,10 +1,10 @@
-"""Run one of the paper's tables or figures on any data set in KITTI's layout.
+"""Reproduce one of the paper's tables or figures on any data set in KITTI's layout.
 
     python experiments/run.py NAME --data ROOT [--seeds 3] [--budget STEPS] [--out DIR]
 
-Trains what it needs, for the validation split of ROOT, and writes DIR/NAME.json, a table beside the paper's numbers and
-the plots. Started again it goes on where it was interrupted; experiments in one DIR share their trainings. A training
-is as the preset says but for --budget, --batch-size and --learning-rate.
+Trains the networks that the experiment needs, scores them on the split val of ROOT, and writes DIR/NAME.json, a table
+with the paper's numbers and the plots. Re-run the same command to resume. Experiments in one DIR share their trainings.
+Trainings follow the preset except for --budget, --batch-size and --learning-rate.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import table3_data
 import table4_modules
 import table5_beta
 import table6_runtime
-from report import Report, check_results, facts_of_run, to_markdown, write_report
+from experiment_report import Report, check_results, facts_of_run, to_markdown, write_report
 from study import Study
 
 from ciassd_jax import Config, load_weights, open_dataset
@@ -43,7 +43,7 @@ from ciassd_jax.training.loop import TrainingError
 
 
 class Experiment(NamedTuple):
-    """What runs, whether it looks at frames, and whether it can measure given weights instead of training."""
+    """The function to run, whether it reads frames, and whether it can measure weights instead of training."""
 
     run: Callable[[Study], Report]
     takes_data: bool = True
@@ -63,7 +63,7 @@ EXPERIMENTS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run an experiment; 2 where the options or the data cannot be used, which one sentence says."""
+    """Run an experiment; return 2 and print one sentence if the options or the data cannot be used."""
     options = parse(arguments)
     try:
         with warnings_as_lines(options.data or "KITTI_ROOT"):
@@ -75,10 +75,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace, command: str) -> None:
-    """Refuse what cannot be done, then do it and write it down."""
+    """Check the options, run the experiment and write its report."""
     experiment = EXPERIMENTS[options.name]
     if options.weights is not None and not experiment.takes_weights:
-        raise InputError(f"{options.name} compares networks that it trains itself; leave out --weights.")
+        raise InputError(f"{options.name} trains the networks that it compares; remove --weights.")
     data = find_root(options.data) if experiment.takes_data else None
     weights = None if options.weights is None else load_weights(find_weights(options.weights))
     config = config_of(options, weights)
@@ -97,7 +97,7 @@ def run(options: argparse.Namespace, command: str) -> None:
 
 
 def config_of(options: argparse.Namespace, weights: Weights | None) -> Config:
-    """The preset, or the config of the weights, with the budget as its schedule."""
+    """Return the preset, or the config of the weights, with the schedule of the options."""
     config = weights.config if weights and not options.preset else PRESETS[options.preset or "car_lite"]()
     changes = {"total_steps": options.budget, "batch_size": options.batch_size, "learning_rate": options.learning_rate}
     given = {name: value for name, value in changes.items() if value is not None}
@@ -105,7 +105,7 @@ def config_of(options: argparse.Namespace, weights: Weights | None) -> Config:
 
 
 def settings_of(config: Config, options: argparse.Namespace, data: Path | None) -> dict[str, Any]:
-    """What results in one folder must have in common; more seeds are welcome."""
+    """Return what all results in one folder must share; the number of seeds may differ."""
     return {
         "config": json.loads(config.to_json()),
         "data": None if data is None else {"folder": data.resolve().name, "val": len(open_dataset(data, "val"))},
@@ -114,17 +114,23 @@ def settings_of(config: Config, options: argparse.Namespace, data: Path | None) 
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The options; argparse ends the program with 2 and the valid names where one is unknown."""
+    """Parse the options; argparse exits with 2 and the valid names for an unknown one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=EXPERIMENTS)
-    parser.add_argument("--data", type=Path, help="folder in KITTI's layout; KITTI_ROOT without it")
-    parser.add_argument("--out", type=Path, default=Path("results"), help="folder of trainings and results (results)")
-    parser.add_argument("--preset", choices=PRESETS, help="what is changed (that of the weights, or car_lite)")
-    parser.add_argument("--seeds", type=_positive, default=1, help="trainings of each variant (1)")
-    parser.add_argument("--budget", type=_positive, help="steps of each training (the preset's)")
-    parser.add_argument("--batch-size", type=_positive, help="scenes a step (the preset's)")
-    parser.add_argument("--learning-rate", type=float, help="its peak (the preset's)")
-    parser.add_argument("--weights", type=Path, help="measure these instead of training: ours, a .pth, a bundled name")
+    parser.add_argument("--data", type=Path, help="folder in KITTI's layout (default: KITTI_ROOT)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("results"), help="folder of trainings and results (default: results)"
+    )
+    parser.add_argument("--preset", choices=PRESETS, help="the config (default: that of the weights, or car_lite)")
+    parser.add_argument("--seeds", type=_positive, default=1, help="trainings per variant (default: 1)")
+    parser.add_argument("--budget", type=_positive, help="steps of each training (default: the preset's)")
+    parser.add_argument("--batch-size", type=_positive, help="scenes per step (default: the preset's)")
+    parser.add_argument("--learning-rate", type=float, help="peak learning rate (default: the preset's)")
+    parser.add_argument(
+        "--weights",
+        type=Path,
+        help="measure these instead of training: a weights file, a released .pth or a bundled name",
+    )
     return parser.parse_args(arguments)
 
 

@@ -1,4 +1,4 @@
-"""What every experiment works with: a folder of frames, a preset with a budget, and trainings that resume."""
+"""The setting of an experiment: frames, a config with a budget, and trainings that resume."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Say = Callable[[str], object]
 
 @dataclass(frozen=True)
 class Study:
-    """Where the frames are, what is trained on them, how often, and where everything is written.
+    """The folder of frames, the config to train, the number of seeds, and the folder for trainings and results.
 
-    `config` is the paper's method in full; its schedule is the budget. An experiment changes one part of it at a time.
-    With `weights` nothing is trained: they are measured instead.
+    `config` is the full method with the budget as its schedule; an experiment changes one part of it at a time. With
+    `weights` nothing is trained: they are measured instead.
     """
 
     data: Path | None
@@ -36,14 +36,14 @@ class Study:
     say: Say = print
 
     def validation(self) -> Dataset:
-        """The frames that are scored."""
+        """Open the frames that are scored."""
         return open_dataset(self.data, "val")
 
     def networks(self, variant: str, config: Config) -> list[Variables]:
-        """The trained network of a variant for each seed: one training each, which goes on where it was interrupted.
+        """Return the trained network of a variant for each seed; interrupted trainings resume.
 
-        `variant` names its folder: experiments that train the same share it. Raises InputError where the folder is of
-        another config or other data.
+        `variant` names the folder of the training, which experiments share. Raises InputError for a folder of another
+        config or data set.
         """
         if self.weights is not None:
             return [self.weights]
@@ -56,7 +56,7 @@ class Study:
         intervals = Intervals(log=min(100, steps), save=min(250, steps), evaluate=0, keep=1)
         fitted = fit(config, self._batches(config, seed), folder, intervals=intervals, progress=True, say=self.say)
         if fitted.stopped is not None:
-            self.say("Interrupted; the same command goes on.")
+            self.say("Interrupted. Re-run the same command to resume.")
             sys.exit(128 + fitted.stopped)
         return variables_of(fitted.state)
 
@@ -71,15 +71,15 @@ class Study:
 
 
 def with_neck(config: Config, kind: str) -> Config:
-    """The config with another neck."""
+    """Return the config with another neck."""
     return replace(config, neck=replace(config.neck, kind=kind))
 
 
 def without_iou(config: Config) -> Config:
-    """The config without the IoU branch."""
+    """Return the config without the IoU branch."""
     return replace(config, head=replace(config.head, predict_iou=False))
 
 
 def with_detection(config: Config, **changes: Any) -> DetectionConfig:
-    """The config's post-processing with some fields changed."""
+    """Return the config's post-processing with some fields changed."""
     return replace(config.detection, **changes)

@@ -1,18 +1,18 @@
-"""Table 3: what each part of the data's preparation contributes.
+"""Table 3: the contribution of each step of data preparation.
 
     python experiments/run.py table3_data --data KITTI --budget 55680 --preset car --seeds 3
 
-As in the paper the network is the baseline, SECOND's neck without IoU branch and with plain rotated NMS, and every row
-adds one switch to the row above: six trainings a seed. Results: README.md.
+As in the paper, the network is the baseline: SECOND's neck, no IoU branch, plain rotated NMS. Every row adds one switch
+to the row above: six trainings per seed. Results: README.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from experiment_report import Report
 from measuring import is_too_small, precisions, score_settings
 from plots import plot_bars
-from report import Report
 from study import Study, with_detection, with_neck, without_iou
 
 from ciassd_jax import Config
@@ -22,14 +22,14 @@ ROWS = {
     "nothing": None,
     "+ global flip, rotation, scaling": "global_transform",
     "+ noise on each object": "object_noise",
-    "+ pasted objects": "paste",
+    "+ pasted objects": "gt_sampling",
     "+ vans count as cars": "similar_classes",
     "+ only easy, moderate and hard objects pasted": "difficulty_filter",
 }
 
 
 def run(study: Study) -> Report:
-    """Train a row's switches, score, go on to the next row."""
+    """Train and score the switches of each row."""
     baseline = without_iou(with_neck(study.config, "second"))
     config = with_switches(baseline, dict.fromkeys(filter(None, ROWS.values()), False))
     rows = []
@@ -40,13 +40,13 @@ def run(study: Study) -> Report:
         networks = study.networks(f"table3-{row}-{switch or 'nothing'}", config)
         found = [score_settings(one, config, settings, study.validation())[title] for one in networks]
         rows.append({"data": title, **precisions(found)})
-    notes = ["The paper's numbers of this table are not at hand. Each row adds its switch to the row above."]
+    notes = ["The paper's numbers of this table were not available. Each row adds its switch to the row above."]
     if is_too_small(rows, PLOTTED):
-        notes.append(f"No row reaches 1 % in {PLOTTED}: the budget is too small to tell them apart.")
+        notes.append(f"No row reaches 1 % in {PLOTTED}: the budget is too small to compare them.")
     return Report("Table 3: the data's preparation", rows, notes, {"": plot_bars(rows, PLOTTED)})
 
 
 def with_switches(config: Config, switches: dict[str, bool]) -> Config:
-    """The config with some of Table 3's switches set."""
+    """Return the config with some of Table 3's switches set."""
     augmentation = replace(config.data.augmentation, **switches)
     return replace(config, data=replace(config.data, augmentation=augmentation))

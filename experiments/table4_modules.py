@@ -1,25 +1,25 @@
-"""Table 4: what SSFA, the rectified confidence and DI-NMS contribute.
+"""Table 4: the contributions of SSFA, confidence rectification and DI-NMS.
 
     python experiments/run.py table4_modules --data KITTI --budget 55680 --preset car --seeds 3
 
-From the baseline, SECOND's neck without IoU branch and with plain rotated NMS, every row adds one thing to the row
-above. Three trainings a seed: rectification and NMS are ways of reading the same raw predictions. Results: README.md.
+The baseline has SECOND's neck, no IoU branch and plain rotated NMS. Every row adds one module to the row above. Three
+trainings per seed: rectification and NMS only change the post-processing. Results: README.md.
 """
 
 from __future__ import annotations
 
+from experiment_report import Report
 from measuring import is_too_small, precisions, score_settings
 from plots import plot_bars
-from report import Report
 from study import Study, with_detection, with_neck, without_iou
 
-# The published accuracy of the whole on KITTI's val (SPEC 11.2); those of the other rows are not at hand.
+# Published 3D AP (R11, moderate) of the full method on KITTI's val (paper Table 2); other rows were not available.
 PAPER = 79.81
 WHOLE = "+ DI-NMS (the paper's)"
 
 
 def run(study: Study) -> Report:
-    """Train the three networks, score the last one in four ways."""
+    """Train the three networks; score the last one with four kinds of post-processing."""
     config = study.config
     plain, rotated = with_detection(config, nms="rotated", iou_exponent=0.0), with_detection(config, nms="rotated")
     networks = {
@@ -48,7 +48,7 @@ def run(study: Study) -> Report:
 
 
 def _order(rows: list[dict]) -> str:
-    """Whether every row of the paper's table is better than the one before, on average over the seeds."""
+    """Say whether each row of the paper's table improves on the row above, on average over the seeds."""
     steps = [row for row in rows if not row["modules"].startswith("...")]
     means = [sum(row["3D R40 moderate"]) / len(row["3D R40 moderate"]) for row in steps]
     if is_too_small(steps):

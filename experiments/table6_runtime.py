@@ -1,11 +1,10 @@
-"""Table 6: how long a frame takes, in three parts.
+"""Table 6: the time per frame, in three parts.
 
     python experiments/run.py table6_runtime --data KITTI --weights WEIGHTS
 
-Batch 1, five runs over the same frames, the median frame of each run. Pre-processing pads the cloud and voxelises it,
-the network goes from voxels to raw predictions, post-processing decodes, rectifies, suppresses and filters. Each part
-is a compiled program of its own that is waited for; `predict`, which is all of them as one, is in the last row.
-Results: README.md.
+Batch 1, five runs over the same frames, the median frame of each run. Pre-processing pads and voxelises the cloud, the
+network maps voxels to raw predictions, post-processing decodes, rectifies, suppresses and filters. Each part is a
+compiled program of its own; the last row is `predict`, which runs all of them as one program. Results: README.md.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from functools import partial
 
 import jax
 import numpy as np
+from experiment_report import Report
 from plots import plot_bars
-from report import Report
 from study import Study
 
 from ciassd_jax import Config, PointCloud
@@ -30,18 +29,18 @@ from ciassd_jax.model.network import predict_voxels, voxelize_batch
 from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.types import Variables
 
-# Milliseconds a frame on a GPU.
+# Milliseconds per frame on a GPU.
 PAPER = {"pre-processing": 2.84, "network": 24.33, "post-processing": 3.59}
 FRAMES, RUNS = 20, 5
 
 
 def run(study: Study) -> Report:
-    """Time the three parts on up to twenty frames."""
+    """Time the parts on up to twenty frames."""
     config, dataset = study.config, study.validation()
     frames = [dataset.read(index) for index in range(min(FRAMES, len(dataset)))]
     parts = parts_of(study.networks("full", config)[0], config)
     runs = [[parts(frame) for frame in frames] for _ in range(RUNS + 1)]
-    # The first run compiled.
+    # The first run includes compilation.
     medians = {part: [float(np.median([one[part] for one in run])) for run in runs[1:]] for part in runs[0][0]}
     whole = medians.pop("whole in one program")
     medians["sum"] = [sum(values) for values in zip(*medians.values(), strict=True)]
@@ -50,13 +49,13 @@ def run(study: Study) -> Report:
     rows = [{"part": part, "milliseconds": values, "paper": paper.get(part)} for part, values in medians.items()]
     notes = [
         f"Median of {len(frames)} frames, mean and range of {RUNS} runs, batch 1.",
-        "The paper measured `car()` on a GPU; our machine is below.",
+        "The paper measured `car()` on a GPU; the machine used here is below.",
     ]
     return Report("Table 6: run time", rows, notes, {"": plot_bars(rows, "milliseconds")})
 
 
 def parts_of(variables: Variables, config: Config) -> Callable[[Frame], dict[str, float]]:
-    """A function that gives the milliseconds of each part on a frame."""
+    """Return a function that measures the milliseconds of each part on a frame."""
     variables = jax.device_put(variables)
     voxelize = jax.jit(partial(voxelize_batch, grid=config.grid))
     network = jax.jit(partial(predict_voxels, config=config))

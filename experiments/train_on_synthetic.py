@@ -1,9 +1,9 @@
-"""The bundled weights: `car_lite` trained on synthetic scenes alone, scored on others and on real frames.
+"""The bundled weights: `car_lite` trained only on simulated streets, scored on other streets and on real frames.
 
     python experiments/train_on_synthetic.py --workdir /tmp/synthetic [--kitti ../shared/kitti]
 
-Each part is a command of `ciassd`, printed before it runs. Started again it goes on: the scenes are kept, the training
-resumes. Writes WORKDIR/car_lite.safetensors; the one in the package is such a file. Results: README.md.
+Each step is a `ciassd` command, printed before it runs. Re-run the same command to resume: scenes are kept and the
+training resumes. Writes WORKDIR/car_lite.safetensors, the file bundled with the package. Results: README.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TRAINING = "--preset car_lite --batch-size 2 --evaluate-every 0 --seed 0"
 
 
 class Cycle(NamedTuple):
-    """One training from the weights of the one before, on scenes of its own."""
+    """One training on its own scenes, from the weights of the cycle before."""
 
     scenes_seed: int
     split: str
@@ -32,7 +32,7 @@ CYCLES = (Cycle(1, "train", 5000, 2e-3), Cycle(3, "trainval", 4500, 1e-3))
 
 
 def run(*words: str | Path) -> None:
-    """Run one command of `ciassd`; the program ends with its exit code where that is not 0."""
+    """Run one `ciassd` command; exit with its code if that is not 0."""
     arguments = [str(word) for word in words]
     print("\n$ ciassd", *arguments, flush=True)
     code = ciassd(arguments)
@@ -41,16 +41,16 @@ def run(*words: str | Path) -> None:
 
 
 def simulate(folder: Path, frames: int, seed: int) -> None:
-    """Write the scenes, unless all are there."""
+    """Write the scenes unless they are complete."""
     if not (folder / f"training/label_2/{frames - 1:06d}.txt").is_file():
         run("data", "synth", folder, "--frames", str(frames), "--seed", str(seed), "--overwrite")
 
 
 def main() -> None:
-    """Simulate, train, convert, score."""
+    """Simulate, train, convert and score."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workdir", type=Path, required=True)
-    parser.add_argument("--kitti", type=Path, help="real frames to score too")
+    parser.add_argument("--kitti", type=Path, help="also score on these real frames")
     options = parser.parse_args()
 
     held_out, weights = options.workdir / "held_out", options.workdir / "car_lite.safetensors"

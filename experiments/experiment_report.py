@@ -1,4 +1,4 @@
-"""What an experiment found, as JSON, a table in Markdown and pictures."""
+"""The report of an experiment: JSON, a Markdown table and figures."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.writing import replacing, write_text
 from ciassd_jax.training.checkpoint import first_difference
 
-# A value of a table: text, a number, one number for each seed, or nothing where it is not at hand.
+# A table cell: text, a number, one number per seed, or None if it is unknown.
 Cell = str | int | float | Sequence[float] | None
 
 
 class Report(NamedTuple):
-    """A title, the rows of a table with the same columns, what must be said of them, and pictures by name."""
+    """A title, the rows of a table (all with the same columns), notes, and figures by name."""
 
     title: str
     rows: Sequence[Mapping[str, Cell]]
@@ -34,22 +34,22 @@ class Report(NamedTuple):
 
 
 def check_results(folder: Path, name: str, settings: dict[str, Any]) -> None:
-    """Raise InputError where `folder` holds this experiment's results of other settings."""
+    """Raise InputError if `folder` holds results of this experiment with other settings."""
     path = folder / f"{name}.json"
     if not path.exists():
         return
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))["settings"]
     except (ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{path} is no result of an experiment; name another folder with --out.") from error
+        raise InputError(f"{path} is not a result of an experiment; choose another folder with --out.") from error
     settings = json.loads(json.dumps(settings))
     if saved != settings:
         difference = first_difference(saved, settings, "settings")
-        raise InputError(f"{path} is of another run: {difference}; name another folder with --out.")
+        raise InputError(f"{path} belongs to another run: {difference}; choose another folder with --out.")
 
 
 def write_report(report: Report, folder: Path, name: str, settings: dict[str, Any], facts: dict[str, Any]) -> None:
-    """Write NAME.json, NAME.md and the pictures NAME.png or NAME_KEY.png."""
+    """Write NAME.json, NAME.md and the figures NAME.png or NAME_KEY.png."""
     files = {key: f"{name}_{key}.png" if key else f"{name}.png" for key in report.figures}
     for key, figure in report.figures.items():
         with replacing(folder / files[key]) as path:
@@ -61,7 +61,7 @@ def write_report(report: Report, folder: Path, name: str, settings: dict[str, An
 
 
 def to_markdown(report: Report, facts: Mapping[str, Any], pictures: Sequence[str] = ()) -> str:
-    """The report as a page."""
+    """Return the report as a Markdown page."""
     lines = [f"# {report.title}", "", *table(report.rows), ""]
     lines += [f"- {note}" for note in report.notes]
     lines += ["", *(f"- {name}: {value}" for name, value in facts.items())]
@@ -71,14 +71,14 @@ def to_markdown(report: Report, facts: Mapping[str, Any], pictures: Sequence[str
 
 
 def table(rows: Sequence[Mapping[str, Cell]]) -> list[str]:
-    """Rows of Markdown."""
+    """Return the rows as a Markdown table."""
     columns = list(rows[0])
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     return lines + ["| " + " | ".join(to_text(row[column]) for column in columns) + " |" for row in rows]
 
 
 def to_text(cell: Cell) -> str:
-    """One value, the mean and the range of several, or a dash for none."""
+    """Format one value, the mean and range of several, or a dash for none."""
     if cell is None:
         return "-"
     if isinstance(cell, str):
@@ -94,19 +94,19 @@ def to_text(cell: Cell) -> str:
 
 
 def facts_of_run(command: str, seconds: float, seeds: int) -> dict[str, Any]:
-    """What a reader needs to judge the numbers."""
+    """Return command, commit, machine, versions, seeds and time of a run."""
     return {
         "command": f"`{command}`",
         "commit": _commit(),
         "machine": machine(),
         "versions": f"ciassd_jax {__version__}, JAX {jax.__version__}, Python {platform.python_version()}",
         "seeds": seeds,
-        "time": f"{seconds / 60:.1f} minutes, what was already trained not counted",
+        "time": f"{seconds / 60:.1f} minutes, excluding trainings that were already complete",
     }
 
 
 def machine() -> str:
-    """The devices that JAX computes on, and the processor."""
+    """Describe the accelerators and the processor."""
     device = jax.devices()[0]
     kind = "" if device.platform == "cpu" else f"{len(jax.devices())} x {device.device_kind}, "
     information = Path("/proc/cpuinfo")
@@ -124,7 +124,7 @@ def _commit() -> str:
 
 
 def _plain(cell: Cell) -> Any:
-    """A value as JSON has it: no number is null."""
+    """Convert a cell for JSON; NaN becomes null."""
     if cell is None or isinstance(cell, str | int):
         return cell
     values = [None if math.isnan(value) else float(value) for value in ([cell] if isinstance(cell, float) else cell)]
