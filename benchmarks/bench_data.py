@@ -24,7 +24,7 @@ from real_frames import SHARED
 from ciassd_jax import car, car_lite, make_batches, open_dataset
 from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Dataset
-from ciassd_jax.data.gt_sampling import ObjectDatabase, build_database, fingerprint_of, open_database
+from ciassd_jax.data.gt_sampling import ObjectDatabase, build_database, open_database
 from ciassd_jax.data.loader import Rows, Stream, finish_scenes, host_batches
 
 WORKERS = (0, 2)
@@ -71,7 +71,7 @@ def main() -> None:
     dataset = open_dataset(arguments.shared / "kitti", "train")
     with tempfile.TemporaryDirectory() as folder:
         build_database(dataset, Path(folder) / "objects.bin")
-        database = open_database(Path(folder) / "objects.bin", fingerprint_of(dataset))
+        database = open_database(Path(folder) / "objects.bin", dataset)
         print(f"{len(dataset)} frames, batches of {arguments.batch}: frames/s, median (range)")
         for preset in (car, car_lite):
             for part, rate in measure_preset(preset(), dataset, database, arguments).items():

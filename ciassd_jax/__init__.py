@@ -3,7 +3,7 @@
 from ciassd_jax.config import Config
 from ciassd_jax.config.presets import car, car_lite, car_released, three_class, tiny
 from ciassd_jax.data.folders import open_dataset
-from ciassd_jax.data.loader import make_batches, one_pass
+from ciassd_jax.data.loader import make_batches
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.predict import predict
 from ciassd_jax.inference.weights import load_weights, save_weights
@@ -28,7 +28,6 @@ __all__ = [
     "init_variables",
     "load_weights",
     "make_batches",
-    "one_pass",
     "open_dataset",
     "predict",
     "save_weights",

@@ -10,8 +10,8 @@ from typing import Any
 
 from ciassd_jax import Config, make_batches, open_dataset
 from ciassd_jax.config import DetectionConfig
-from ciassd_jax.data.folders import database_path, find_database
 from ciassd_jax.data.frames import Dataset
+from ciassd_jax.data.gt_sampling import database_path, find_database
 from ciassd_jax.data.loader import Batches
 from ciassd_jax.model.network import variables_of
 from ciassd_jax.training.loop import Intervals, fit
@@ -65,7 +65,7 @@ class Study:
         database = None
         if config.data.augmentation.gt_sampling:
             places = [database_path(folder, "train") for folder in (self.data, self.out) if folder is not None]
-            database = find_database(dataset, places, say=self.say)
+            database = find_database(dataset, places, log=self.say)
         options: dict[str, Any] = {"seed": seed, "batch_size": config.schedule.batch_size, "database": database}
         return make_batches(dataset, config, **options)
 

@@ -12,7 +12,7 @@ from small import compiling_quickly, random_variables, small_config
 
 from ciassd_jax import Config, make_batches, open_dataset
 from ciassd_jax.config import DataConfig
-from ciassd_jax.data.folders import find_database
+from ciassd_jax.data.gt_sampling import find_database
 from ciassd_jax.data.loader import Batches
 from ciassd_jax.training import loop
 from ciassd_jax.training.loop import Fitted, Intervals, fit
@@ -42,7 +42,7 @@ def write_data(root: Path) -> Path:
 
 def mini_batches(root: Path, config: Config, **options: Any) -> Batches:
     dataset = open_dataset(root, "train")
-    database = find_database(dataset, [root / "objects_train.bin"], say=lambda text: None)
+    database = find_database(dataset, [root / "objects_train.bin"], log=lambda text: None)
     return make_batches(dataset, config, **{"seed": 3, "batch_size": 2, "database": database} | options)
 
 

@@ -1,4 +1,4 @@
-"""Slow references of augmentation: SPEC 2.3 and 2.4 as they stand, box after box, with polygons by shapely."""
+"""Slow references of augmentation (section 4.1): box after box, with polygons by shapely."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def collide(a: shapely.Polygon, b: shapely.Polygon) -> bool:
 def accept_by_loop(
     truth: np.ndarray, boxes: np.ndarray, valid: np.ndarray, wanted: np.ndarray, gt_sampling_up_to: tuple[int, ...]
 ) -> np.ndarray:
-    """Which of the drawn boxes (O, 7) are pasted among the truth boxes (n, 7)."""
+    """Which of the drawn boxes (O, 7) are added to the truth boxes (n, 7)."""
     placed, accepted, start = [footprint(box) for box in truth], np.zeros(len(boxes), bool), 0
     for label, slots in enumerate(gt_sampling_up_to):
         missing = int(wanted[label])

@@ -192,7 +192,7 @@ class Train:
 
     def _database(self, dataset: Dataset, config: Config, root: Path, say: Any) -> ObjectDatabase | None:
         """The data set's own database, or one in the workdir; none where nothing is pasted."""
-        from ciassd_jax.data.folders import database_path, find_database
+        from ciassd_jax.data.gt_sampling import database_path, find_database
         from ciassd_jax.training.distributed import on_first
 
         pasted = config.data.augmentation.gt_sampling and any(one.gt_sampling_up_to for one in config.classes)

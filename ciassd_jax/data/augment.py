@@ -1,7 +1,7 @@
-"""Augmentation of one padded scene on the device (paper section 4.1, SPEC section 2.2 to 2.4); `vmap` for a batch.
+"""Augmentation of one padded scene on the device (section 4.1); `vmap` it for a batch.
 
-Every step is a pure function with fixed shapes and leaves padding zero. Where a step needs chance, the numbers that it
-drew are the arguments of a function without any, so that the step can be held against its definition.
+Every step is a pure function with fixed shapes and keeps padding zero. A random step draws its numbers and passes them
+to a deterministic function, which tests compare with its definition.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from ciassd_jax.types import Array, Boxes, GroundTruth, PointCloud, SampledObjec
 
 
 def scene_key(seed: int | Array, epoch: int | Array, frame: int | Array) -> jax.Array:
-    """The key of a scene's augmentation: the same numbers draw the same bits, in whatever order scenes come."""
+    """Return the key of a scene's augmentation, which does not depend on the order of the scenes."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), epoch), frame)
 
 
 def augment(key: jax.Array, scene: Scene, objects: SampledObjects, config: Config) -> Scene:
-    """Augment one scene in the order of SPEC 2.2, as the switches of `config.data.augmentation` say.
+    """Augment one scene as configured by `config.data.augmentation`.
 
-    Obstacles keep objects apart and leave at the end. Each step has a key of its own: switching one off leaves
-    what the others draw.
+    The steps are ground-truth sampling, noise on each object, flip, rotation and scaling of the scene, and shuffling
+    of its points. Obstacles block other objects and are dropped at the end. Each step has its own key, so that
+    disabling one does not change what the others draw.
     """
     switches = config.data.augmentation
     for_noise, for_transform, for_order = jax.random.split(key, 3)
     gt_sampling_up_to = tuple(one.gt_sampling_up_to for one in config.classes)
     if switches.gt_sampling and any(gt_sampling_up_to):
-        scene = paste_objects(scene, objects, gt_sampling_up_to=gt_sampling_up_to)
+        scene = add_sampled_objects(scene, objects, gt_sampling_up_to=gt_sampling_up_to)
     if switches.object_noise:
         scene = add_object_noise(for_noise, scene, switches)
     if switches.global_transform:
@@ -40,30 +41,30 @@ def augment(key: jax.Array, scene: Scene, objects: SampledObjects, config: Confi
     return keep_targets(scene, minimum=config.grid.minimum, maximum=config.grid.maximum)
 
 
-def paste_objects(scene: Scene, objects: SampledObjects, *, gt_sampling_up_to: tuple[int, ...]) -> Scene:
-    """Add the objects that collide with nothing, their points first; scene points inside them leave (SPEC 2.2, 2.3).
+def add_sampled_objects(scene: Scene, objects: SampledObjects, *, gt_sampling_up_to: tuple[int, ...]) -> Scene:
+    """Add the sampled objects that collide with nothing, their points first, and remove scene points inside them.
 
-    `gt_sampling_up_to` is the number of slots of one round for every class, not all 0. What finds no room is counted:
-    an object without a free box is not pasted, and points are cut from the end of the scene's.
+    `gt_sampling_up_to` is the number of slots per round of each class, not all 0. An object without a free box slot is
+    not added, and points over capacity are cut from the end of the scene's; both are counted.
     """
     accepted = accept_objects(scene.truth, objects, gt_sampling_up_to=gt_sampling_up_to)
-    pasted = accepted & (scene.truth.count + jnp.cumsum(accepted) <= scene.truth.label.shape[0])
+    added = accepted & (scene.truth.count + jnp.cumsum(accepted) <= scene.truth.label.shape[0])
 
     points, capacity = scene.cloud.points, scene.cloud.points.shape[0]
-    covered = jnp.any(points_in_boxes(points, objects.boxes) & pasted[:, None], 0)
-    comes = jnp.take(pasted, objects.owner, mode="fill", fill_value=False)
+    covered = jnp.any(points_in_boxes(points, objects.boxes) & added[:, None], 0)
+    comes = jnp.take(added, objects.owner, mode="fill", fill_value=False)
     kept = jnp.concatenate([comes, _real_points(scene) & ~covered])
     total = kept.sum(dtype=jnp.int32)
     points = _pick(jnp.concatenate([objects.points, points]), kept, capacity)
 
     boxes = Boxes(*(jnp.concatenate(pair) for pair in zip(scene.truth.boxes, objects.boxes, strict=True)))
     truth = GroundTruth(boxes, jnp.concatenate([scene.truth.label, objects.label]), scene.truth.count)
-    kept = jnp.concatenate([_real_boxes(scene.truth), pasted])
+    kept = jnp.concatenate([_real_boxes(scene.truth), added])
     return scene._replace(
         cloud=PointCloud(points, jnp.minimum(total, capacity)),
         truth=_pick_truth(truth, kept, scene.truth.label.shape[0]),
         points_cut=scene.points_cut + jnp.maximum(total - capacity, 0),
-        boxes_cut=scene.boxes_cut + (accepted & ~pasted).sum(dtype=jnp.int32),
+        boxes_cut=scene.boxes_cut + (accepted & ~added).sum(dtype=jnp.int32),
         objects_cut=scene.objects_cut + objects.cut,
     )
 
@@ -71,10 +72,10 @@ def paste_objects(scene: Scene, objects: SampledObjects, *, gt_sampling_up_to: t
 def accept_objects(
     truth: GroundTruth, objects: SampledObjects, *, gt_sampling_up_to: tuple[int, ...]
 ) -> Bool[Array, " O"]:
-    """Which objects are pasted (SPEC 2.3): per class two rounds, the second of as many draws as are still wanted.
+    """Return which sampled objects to add: two rounds per class, the second for the objects still lacking.
 
-    Draws of a round are judged in order. One is out if it collides with a truth box, an accepted object or a later
-    draw of its round, so that of two draws that collide the earlier one is out.
+    The draws of a round are tested in order. A draw is rejected if it collides with a truth box, an accepted object or
+    a later draw of its round; of two draws that collide the earlier one is therefore rejected.
     """
     boxes = _with_axis(objects.boxes, 1)
     blocked = jnp.any(footprints_collide(boxes, _with_axis(truth.boxes, 0)) & _real_boxes(truth)[None], 1)
@@ -98,7 +99,7 @@ def accept_objects(
 
 
 def add_object_noise(key: jax.Array, scene: Scene, config: AugmentationConfig) -> Scene:
-    """Shift and turn every target with its points, by the first of its tries that collides with nothing (SPEC 2.4)."""
+    """Shift and rotate every target with its points, by the first of its tries that collides with nothing."""
 
     def draw(slot: Array) -> tuple[jax.Array, jax.Array]:
         for_shift, for_turn = jax.random.split(jax.random.fold_in(key, slot))
@@ -106,16 +107,16 @@ def add_object_noise(key: jax.Array, scene: Scene, config: AugmentationConfig) -
         limit = config.noise_rotation
         return shift, jax.random.uniform(for_turn, (config.noise_tries,), minval=-limit, maxval=limit)
 
-    # A key per box: how many boxes a scene has room for changes nothing.
+    # One key per box, so that the capacity for boxes does not change the draws.
     shifts, turns = jax.vmap(draw)(jnp.arange(scene.truth.label.shape[0]))
     return move_objects(scene, shifts, turns)
 
 
 def move_objects(scene: Scene, shifts: Float[Array, "G T 3"], turns: Float[Array, "G T"]) -> Scene:
-    """Move each target by the first of its T shifts (metres) and turns (radians) that keeps it clear of all others.
+    """Move each target by the first of its T shifts (metres) and turns (radians) that collides with no other box.
 
-    Boxes go in order, and those that moved count at their new place; where no try is clear, the box stays. A point
-    follows the first target that held it before any moved. Points at the destination stay.
+    Boxes move one after the other and later ones see the new places; without a free try a box stays. A point moves
+    with the first target that contained it before any moved. Points at the destination stay.
     """
     boxes, label, count = scene.truth
     slots, real = jnp.arange(label.shape[0], dtype=jnp.int32), _real_boxes(scene.truth)
@@ -141,7 +142,7 @@ def move_objects(scene: Scene, shifts: Float[Array, "G T 3"], turns: Float[Array
 
 
 def _carry(points: Array, owner: Array, before: Boxes, after: Boxes) -> Array:
-    """Points after the move of the box of slot `owner`; without a move they keep their bits."""
+    """Return points moved with the box of slot `owner`; points of a box that stays keep their bits."""
     turn = after.yaw - before.yaw
     moves = jnp.any(before.center != after.center, 1) | (turn != 0)
     table = jnp.concatenate([before.center, after.center, jnp.stack([jnp.cos(turn), jnp.sin(turn), moves], 1)], 1)
@@ -152,7 +153,7 @@ def _carry(points: Array, owner: Array, before: Boxes, after: Boxes) -> Array:
 
 
 def transform_globally(key: jax.Array, scene: Scene, config: AugmentationConfig) -> Scene:
-    """Flip the scene or not, turn it and scale it (SPEC 2.2, steps 6 to 8)."""
+    """Flip the scene at random, then rotate and scale it."""
     for_flip, for_angle, for_factor = jax.random.split(key, 3)
     angle = jax.random.uniform(for_angle, minval=-config.max_rotation, maxval=config.max_rotation)
     factor = jax.random.uniform(for_factor, minval=config.min_scale, maxval=config.max_scale)
@@ -161,7 +162,7 @@ def transform_globally(key: jax.Array, scene: Scene, config: AugmentationConfig)
 
 
 def flip(scene: Scene, mirrored: Bool[Array, ""]) -> Scene:
-    """Mirror y and yaw where `mirrored`."""
+    """Mirror y and yaw if `mirrored`."""
     sign = jnp.where(mirrored, -1.0, 1.0)
     (center, size, yaw), points = scene.truth.boxes, scene.cloud.points
     mirror = jnp.ones(4).at[1].set(sign)[None]
@@ -169,7 +170,7 @@ def flip(scene: Scene, mirrored: Bool[Array, ""]) -> Scene:
 
 
 def rotate(scene: Scene, angle: Float[Array, ""]) -> Scene:
-    """Turn the scene by `angle` radians about the z axis, counter-clockwise."""
+    """Rotate the scene by `angle` radians about the z axis, counter-clockwise."""
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     (center, size, yaw), points = scene.truth.boxes, scene.cloud.points
     turned = yaw + jnp.where(_real_boxes(scene.truth), angle, 0)
@@ -177,24 +178,25 @@ def rotate(scene: Scene, angle: Float[Array, ""]) -> Scene:
 
 
 def scale(scene: Scene, factor: Float[Array, ""]) -> Scene:
-    """Multiply places and sizes by `factor`."""
+    """Multiply coordinates and sizes by `factor`."""
     (center, size, yaw), points = scene.truth.boxes, scene.cloud.points
     factors = jnp.ones(4).at[:3].set(factor)[None]
     return _with_geometry(scene, points * factors, Boxes(center * factor, size * factor, yaw))
 
 
 def shuffle_points(key: jax.Array, scene: Scene) -> Scene:
-    """Put the real points into random order; every order is as likely."""
+    """Put the real points into a uniformly random order."""
     points = scene.cloud.points
-    # By two keys: padding stays last.
+    # The second key keeps padding last.
     order = jnp.lexsort((jax.random.bits(key, points.shape[:1]), ~_real_points(scene)))
     return scene._replace(cloud=scene.cloud._replace(points=jnp.take(points, order, axis=0)))
 
 
 def keep_targets(scene: Scene, *, minimum: tuple[float, float, float], maximum: tuple[float, float, float]) -> Scene:
-    """Drop obstacles and targets without a footprint corner strictly inside the range in x and y (SPEC 1.6).
+    """Drop obstacles, and targets without a footprint corner strictly inside the range in x and y.
 
-    Scenes that are not augmented need it too. What leaves is not counted in `boxes_cut`: it was no target.
+    Scenes that are not augmented need this step too. `boxes_cut` does not count the dropped boxes, as none of them is
+    a target.
     """
     corners = footprint_corners(scene.truth.boxes)
     low, high = (jnp.array(limit[:2], corners.dtype)[None, None] for limit in (minimum, maximum))
@@ -220,18 +222,18 @@ def _with_axis(boxes: Boxes, axis: int) -> Boxes:
 
 
 def _turned(points: Array, cosine: Array, sine: Array) -> Array:
-    """Points (x and y first) turned counter-clockwise about the z axis."""
+    """Return points (x and y first) rotated counter-clockwise about the z axis."""
     x, y = points[:, 0], points[:, 1]
     return jnp.concatenate([jnp.stack([x * cosine - y * sine, x * sine + y * cosine], 1), points[:, 2:]], 1)
 
 
 def _pick(array: Array, kept: Array, size: int, fill: int = 0) -> Array:
-    """The first `size` kept rows in order, then rows of `fill`."""
+    """Return the first `size` kept rows in order, padded with `fill`."""
     rows = jnp.flatnonzero(kept, size=size, fill_value=kept.shape[0])
     return jnp.take(array, rows, axis=0, mode="fill", fill_value=fill)
 
 
 def _pick_truth(truth: GroundTruth, kept: Array, size: int) -> GroundTruth:
-    """The kept boxes; at most `size` of them."""
+    """Return the first `size` kept boxes, padded."""
     boxes = jax.tree.map(lambda leaf: _pick(leaf, kept, size), truth.boxes)
     return GroundTruth(boxes, _pick(truth.label, kept, size, fill=-1), kept.sum(dtype=jnp.int32))

@@ -1,4 +1,4 @@
-"""Clouds in files to results in files: which clouds, with which calibration, written where."""
+"""Point clouds to run the detector on, with their calibrations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ciassd_jax.formats.points import POINT_SUFFIXES, read_points
 
 
 class CloudFile(NamedTuple):
-    """A file of points, and its camera where that is known."""
+    """A file of points, and its camera if known."""
 
     cloud: Path
     camera: Camera | None
@@ -22,12 +22,12 @@ class CloudFile(NamedTuple):
 def find_clouds(
     path: Pathlike, *, calib: Pathlike | None = None, image_size: tuple[int, int] | None = None
 ) -> list[CloudFile]:
-    """The cloud at `path`, or the clouds in that folder by name, each with its camera.
+    """Return the cloud at `path`, or the clouds in that folder in the order of their names, each with its camera.
 
-    `calib` is a calibration file for all clouds or a folder with one for each; without it, `X/calib/NAME.txt` serves
-    `X/velodyne*/NAME.bin` where it is there. The size of the image is as given, else that of
-    `X/image_2/NAME.png`, else KITTI's for the focal length. Raises InputError for what could not be predicted,
-    as far as that shows without reading everything.
+    `calib` is a calibration file for all clouds or a folder with one per cloud; it defaults to `X/calib/NAME.txt` for
+    `X/velodyne*/NAME.bin` if that exists. The size of the image is `image_size`, else that of `X/image_2/NAME.png`,
+    else KITTI's for the focal length. Raises InputError for a cloud or a calibration that cannot be used; of several
+    clouds only names and sizes are checked.
     """
     clouds = _find_clouds(Path(path))
     for cloud in clouds:
@@ -36,8 +36,8 @@ def find_clouds(
 
 
 def find_beside(cloud: Path, folder: str, suffix: str) -> Path | None:
-    """The file of the same frame in a folder beside that of the cloud, where it is there."""
-    # Absolute, as the cloud may be named from inside its folder.
+    """Return the file of the same frame in a folder beside the cloud's, or None if it does not exist."""
+    # Absolute, because a relative path may not name the cloud's folder.
     path = cloud.absolute().parent.parent / folder / f"{cloud.stem}{suffix}"
     return path if path.is_file() else None
 
@@ -53,7 +53,7 @@ def _find_clouds(path: Path) -> list[Path]:
 
 
 def _check_distinct(clouds: Sequence[Path]) -> None:
-    """Results are named by the stem, so no two clouds may share one."""
+    """Raise InputError for two clouds of one stem, which names their results."""
     by_stem: dict[str, Path] = {}
     for cloud in clouds:
         other = by_stem.setdefault(cloud.stem, cloud)
@@ -62,7 +62,7 @@ def _check_distinct(clouds: Sequence[Path]) -> None:
 
 
 def _check_cloud(cloud: Path, *, whole: bool) -> None:
-    """Raise InputError for a cloud that cannot be read: by its name and size alone unless `whole`."""
+    """Raise InputError for a cloud that cannot be used, judged by its name and size alone unless `whole`."""
     read_bytes(cloud, 0)
     size, suffix = cloud.stat().st_size, cloud.suffix.lower()
     if whole or not size or suffix not in POINT_SUFFIXES or (suffix == ".bin" and size % 16):
@@ -86,10 +86,10 @@ def _find_calibration(cloud: Path, given: Pathlike | None) -> Path | None:
         return path
     path = path / f"{cloud.stem}.txt"
     if not path.is_file():
-        raise InputError(f"{path} does not exist, so {cloud} has no calibration; add it, or leave out --calib.")
+        raise InputError(f"{path} does not exist, so {cloud} has no calibration; add it, or leave out `calib`.")
     return path
 
 
 def _beside(cloud: Path, folder: str, suffix: str) -> Path | None:
-    """As `find_beside`, in KITTI's layout alone."""
+    """Return `find_beside` for a cloud in KITTI's layout, else None."""
     return find_beside(cloud, folder, suffix) if cloud.absolute().parent.name.startswith("velodyne") else None

@@ -1,7 +1,7 @@
-"""The ground-truth database: the objects of a data set with their points, to be pasted into its scenes (SPEC 2.1, 2.3).
+"""Ground-truth sampling: a database of a data set's objects with their points, and the objects drawn for a scene.
 
-One file: a magic number, the points (x, y, z minus the centre of their box, intensity) as float32, one record per
-object, a JSON footer, and the footer's length in 8 bytes. All numbers are little-endian.
+The database is one file: a magic number, the points (x, y, z minus the centre of their box, intensity) as float32,
+one record per object, a JSON footer, and the footer's length in 8 bytes. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from ciassd_jax.types import Boxes, SampledObjects
 
 _MAGIC = b"ciassd objects 1"
 _POINT = np.dtype(("<f4", 4))
-# `name` is an index into the footer's names, `frame` and `row` are the object's place in the data set, and `first` and
-# `count` those of its points in the file.
+# `name` is an index into the footer's names; `frame` and `row` locate the object in the data set, `first` and `count`
+# its points in the file.
 _OBJECT = np.dtype(
     [
         ("box", "<f8", 7),
@@ -44,9 +44,9 @@ _REMEDY = "build it again with `ciassd data prepare`"
 
 @dataclass(frozen=True, eq=False)
 class ObjectDatabase:
-    """Every object of a data set: one record of `objects` each; `points` stay in the file until they are read.
+    """The objects of a data set, one record of `objects` each; `points` are mapped from the file.
 
-    Workers can pickle it: they map the file themselves.
+    Worker processes can pickle it: they map the file themselves, and do not read the data set.
     """
 
     path: Path
@@ -56,13 +56,58 @@ class ObjectDatabase:
     points: Float32[np.ndarray, "M 4"]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return open_database, (self.path, self.fingerprint)
+        return _map_database, (self.path, self.fingerprint)
+
+
+def database_path(folder: Path, split: str) -> Path:
+    """Return the usual file of a split's database in a folder."""
+    return folder / f"objects_{split}.bin"
+
+
+def find_database(
+    dataset: Dataset,
+    places: Sequence[Path],
+    track: Callable[[range], Iterable[int]] = iter,
+    log: Callable[[str], object] = print,
+) -> ObjectDatabase:
+    """Open the first of these files that is the database of the data set; without any, build the last one.
+
+    `track` wraps the iteration over the frames, for a progress bar; `log` is told when the database is built. Raises
+    InputError for a frame that cannot be read and a file that cannot be written.
+    """
+    fingerprint = fingerprint_of(dataset)
+    for place in places:
+        try:
+            return _map_database(place, fingerprint)
+        except InputError:
+            continue
+    log(f"Collecting the objects for ground-truth sampling from {len(dataset)} frames into {places[-1]}.")
+    _write_database(dataset, places[-1], fingerprint, track)
+    return _map_database(places[-1], fingerprint)
+
+
+def open_database(path: Pathlike, dataset: Dataset) -> ObjectDatabase:
+    """Open the database of a data set.
+
+    Raises InputError, one sentence with the remedy, for a file that is missing, not a database, cut short or stale.
+    """
+    return _map_database(Path(path), fingerprint_of(dataset))
+
+
+def build_database(dataset: Dataset, path: Pathlike, track: Callable[[range], Iterable[int]] = iter) -> None:
+    """Write the database of all objects of the data set, of any class, difficulty and number of points.
+
+    An object has the points strictly inside its box. The file is written frame by frame and appears whole or not at
+    all. `track` wraps the iteration over the frames, for a progress bar. Raises InputError for a frame that cannot be
+    read and a file that cannot be written.
+    """
+    _write_database(dataset, Path(path), fingerprint_of(dataset), track)
 
 
 def fingerprint_of(dataset: Dataset) -> str:
-    """What a database is made of, as a hash: the frames' names, the text of labels and calibration, sizes of clouds.
+    """Return a hash of what a database is made of: names of frames, text of labels and calibration, sizes of clouds.
 
-    Frames that come from no files are read.
+    Frames that do not come from files are read.
     """
     digest = hashlib.sha256()
     for index, name in enumerate(dataset.names):
@@ -76,18 +121,13 @@ def fingerprint_of(dataset: Dataset) -> str:
     return digest.hexdigest()
 
 
-def build_database(dataset: Dataset, path: Pathlike, progress: Callable[[range], Iterable[int]] = iter) -> None:
-    """Write the database of every object of the data set, whatever its class, difficulty and number of points.
-
-    An object has the points strictly inside its box. The file is written frame by frame and appears whole or not at
-    all; `progress` may be tqdm. Raises InputError for a frame that cannot be read and a file that cannot be written.
-    """
-    fingerprint, total = fingerprint_of(dataset), 0
+def _write_database(dataset: Dataset, path: Path, fingerprint: str, track: Callable[[range], Iterable[int]]) -> None:
+    total = 0
     names: dict[str, int] = {}
     records: list[tuple] = []
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         stream.write(_MAGIC)
-        for index in progress(range(len(dataset))):
+        for index in track(range(len(dataset))):
             frame = dataset.read(index)
             inside = points_in_boxes(frame.points, frame.boxes)
             for row, box in enumerate(frame.boxes.to_array()):
@@ -103,29 +143,26 @@ def build_database(dataset: Dataset, path: Pathlike, progress: Callable[[range],
         stream.write(text + np.array(len(text), _LENGTH).tobytes())
 
 
-def open_database(path: Pathlike, fingerprint: str) -> ObjectDatabase:
-    """Map a database; `fingerprint` is that of the data set it must come from.
-
-    Raises InputError, one sentence with the remedy, for a file that is missing, no database, cut short or stale.
-    """
+def _map_database(path: Path, fingerprint: str) -> ObjectDatabase:
+    """Map a database that has this fingerprint."""
     content = read_bytes(path, len(_MAGIC))
     if content != _MAGIC:
-        raise InputError(f"{path} is no ground-truth database of this version; {_REMEDY}.")
-    footer = _read_footer(Path(path))
+        raise InputError(f"{path} is not a ground-truth database of this version; {_REMEDY}.")
+    footer = _read_footer(path)
     if footer is None:
         raise InputError(f"{path} is damaged or cut short; {_REMEDY}.")
     if footer["fingerprint"] != fingerprint:
-        raise InputError(f"{path} is stale: frames, labels or clouds differ from those it was made of; {_REMEDY}.")
+        raise InputError(f"{path} is stale: frames, labels or clouds have changed since it was built; {_REMEDY}.")
     objects = np.fromfile(path, _OBJECT, footer["objects"], offset=len(_MAGIC) + footer["points"] * _POINT.itemsize)
     shape = (footer["points"], 4)
-    # Nothing cannot be mapped.
+    # An empty array cannot be mapped.
     empty = np.zeros(shape, np.float32)
     points = np.memmap(path, "<f4", "r", len(_MAGIC), shape) if footer["points"] else empty
-    return ObjectDatabase(Path(path), fingerprint, tuple(footer["names"]), objects, points)
+    return ObjectDatabase(path, fingerprint, tuple(footer["names"]), objects, points)
 
 
 def _read_footer(path: Path) -> dict[str, Any] | None:
-    """The footer, or None unless it accounts for every byte of the file."""
+    """Return the footer, or None unless it accounts for every byte of the file."""
     size, tail = path.stat().st_size, _LENGTH.itemsize
     with open(path, "rb") as stream:
         stream.seek(max(size - tail, 0))
@@ -143,7 +180,7 @@ def _read_footer(path: Path) -> dict[str, Any] | None:
 
 
 def no_objects(config: Config) -> SampledObjects:
-    """Nothing to paste, in the shapes of the config: for a scene that is not augmented, or has no database."""
+    """Return no objects, in the shapes of the config, for a scene that is not augmented or has no database."""
     label = np.repeat(
         np.arange(len(config.classes), dtype=np.int32), [2 * one.gt_sampling_up_to for one in config.classes]
     )
@@ -159,15 +196,15 @@ def no_objects(config: Config) -> SampledObjects:
     )
 
 
-def draw_objects(
+def sample_objects(
     database: ObjectDatabase, names_in_scene: Sequence[str], *, seed: int, epoch: int, frame: int, config: Config
 ) -> SampledObjects:
-    """Draw what may be pasted into a scene with objects of these types, as NumPy arrays (SPEC 2.3).
+    """Draw objects for a scene with objects of these types, as NumPy arrays (section 4.1).
 
-    Of every class `gt_sampling_up_to` minus the objects of exactly its name are wanted, and up to twice as many are
-    drawn for the two rounds, none twice. The draw depends on (seed, epoch, frame) alone, none of them negative, so that
-    workers and resumed runs agree. The released code walks a shuffled list of the database instead: it uses objects
-    more evenly, but what a scene gets depends on which worker asks when (SPEC 14.5).
+    A class lacks `gt_sampling_up_to` minus the objects of exactly its name, and up to twice that number is drawn, for
+    two rounds without repetition. The draw depends on (seed, epoch, frame) alone, all non-negative, so that workers
+    and resumed runs agree. The released code walks through a shuffled list of the database instead, which uses objects
+    more evenly, but what a scene gets then depends on the order of the workers' requests.
     """
     objects, switches = no_objects(config), config.data.augmentation
     if not switches.gt_sampling:
@@ -186,7 +223,7 @@ def draw_objects(
 
 
 def eligible_objects(database: ObjectDatabase, one: ClassConfig, *, difficulty_filter: bool) -> Int[np.ndarray, " E"]:
-    """The database's objects of exactly the class's name with enough points and, if filtered, of some difficulty."""
+    """Return the objects of exactly the class's name with enough points and, if filtered, with a difficulty."""
     if one.name not in database.names:
         return np.zeros(0, np.int64)
     objects = database.objects
@@ -195,7 +232,7 @@ def eligible_objects(database: ObjectDatabase, one: ClassConfig, *, difficulty_f
 
 
 def _fill(objects: SampledObjects, database: ObjectDatabase, drawn: Int[np.ndarray, " O"]) -> None:
-    """Write boxes and points of the drawn objects (-1 for none) in place; one whose points do not fit is cut."""
+    """Write boxes and points of the drawn objects (-1: none) in place; an object whose points do not fit is cut."""
     filled = 0
     for slot in np.flatnonzero(drawn >= 0):
         record = database.objects[drawn[slot]]

@@ -1,4 +1,4 @@
-"""Labelled frames to scenes of fixed size."""
+"""Labelled frames padded to scenes of fixed size."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ OBSTACLE = -1
 def pad_frame(frame: Frame, index: int, config: Config) -> Scene:
     """Pad a frame to the capacities of `config.data`, as NumPy arrays; `index` is its place in the data set.
 
-    An object is the target of the class with its name, or with `similar_classes` of the class that names it similar;
-    every other object is an obstacle (label -1), and with `filter_scenes` one of no difficulty too. Points over
-    capacity are cut evenly from the whole cloud, boxes from the end. Raises InputError for a box that is none.
+    An object is a target of the class with its name or, with `similar_classes`, of the class that lists it as similar.
+    Other objects are obstacles (label -1), and with `filter_scenes` so are those without a difficulty. Points over
+    capacity are cut evenly from the whole cloud, boxes from the end; both are counted. Raises InputError for a box
+    whose values are not finite or whose size is not positive.
     """
     _check_boxes(frame)
     data = config.data
@@ -40,7 +41,7 @@ def pad_frame(frame: Frame, index: int, config: Config) -> Scene:
 
 
 def target_labels(frame: Frame, config: Config) -> Int[np.ndarray, " G"]:
-    """The class that each object of the frame is a target of, -1 for an obstacle."""
+    """Return the class that each object of the frame is a target of, -1 for an obstacle."""
     augmentation = config.data.augmentation
     labels = {name: label for label, one in enumerate(config.classes) for name in one.similar}
     if not augmentation.similar_classes:
@@ -51,7 +52,7 @@ def target_labels(frame: Frame, config: Config) -> Int[np.ndarray, " G"]:
 
 
 def _spread(count: int, capacity: int) -> Int[np.ndarray, " kept"]:
-    """Which of `count` points to keep: evenly spread, as their order goes by beam and direction."""
+    """Return the points to keep: evenly spaced, because a cloud is ordered by beam and direction."""
     if count <= capacity:
         return np.arange(count)
     return np.arange(capacity) * count // capacity
@@ -64,5 +65,5 @@ def _check_boxes(frame: Frame) -> None:
         size = " x ".join(f"{edge:g}" for edge in frame.boxes.size[index])
         raise InputError(
             f"Frame {frame.name}: object {index} ({frame.names[index]}) has the size {size} or a value that is not "
-            "finite; mend or remove its line in the label file."
+            "finite; correct or remove its line in the label file."
         )

@@ -1,4 +1,4 @@
-"""Which frames a split names, and whether their files are there."""
+"""The frames of a split, and whether their files exist."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from ciassd_jax.formats.errors import InputError, read_bytes
 
-# Where the files of a frame may lie, best place first: kind of file to paths with {} for the frame.
+# Kind of file to the paths where a frame may have it, {} for the frame; the first that exists is used.
 Places = Mapping[str, Sequence[str]]
-# The split of every frame that is there.
+# The split of all frames that have files.
 ALL = "all"
 
 NUM_TRAINING, NUM_TESTING = 7481, 7518
@@ -35,7 +35,7 @@ _TRAIN_BITS = (
 
 
 def official_split(split: str) -> tuple[str, ...] | None:
-    """Names of the frames of the official train, val, trainval or test list (SPEC 1.5); None for another name."""
+    """Return the frames of KITTI's train, val, trainval or test list; None for another name."""
     train = np.unpackbits(np.frombuffer(base64.b64decode(_TRAIN_BITS), np.uint8), count=NUM_TRAINING).astype(bool)
     frames = {
         "train": np.flatnonzero(train),
@@ -47,26 +47,26 @@ def official_split(split: str) -> tuple[str, ...] | None:
 
 
 def split_names(root: Path, split: str, folder: Path, places: Places) -> tuple[str, ...]:
-    """Names of a split's frames (`listed_names`), each once and with its files in `folder`.
+    """Return the names of a split's frames (`listed_names`), each once and with its files in `folder`.
 
     Raises InputError for a split that is unknown, empty or names a frame twice, and for frames without their files.
     """
     names, source = listed_names(root, split, folder, places)
     if not names:
-        raise InputError(f"{source} names no frame; check the path, or list them one a line.")
+        raise InputError(f"{source} names no frame; check the path, or list them, one per line.")
     twice = repeated_names(names)
     if twice:
         raise InputError(f"{source}: {twice[0]}; list it once.")
     missing = missing_files(folder, places, names)
     if missing:
-        raise InputError(f"{source}: {missing[0]}; copy them, or list those you have in {split_file(root, split)}.")
+        raise InputError(f"{source}: {missing[0]}; copy them, or list the others in {split_file(root, split)}.")
     return names
 
 
 def listed_names(root: Path, split: str, folder: Path, places: Places) -> tuple[tuple[str, ...], str]:
-    """Names of a split as they are listed, and where: `ImageSets/SPLIT.txt`, or the official list for KITTI's layout.
+    """Return the names of a split as listed, and their source: `ImageSets/SPLIT.txt`, else KITTI's official list.
 
-    The split "all" is every frame that has a file in `folder`. Raises InputError for a split that nothing lists.
+    The split "all" has every frame with a file in `folder`. Raises InputError for a split without a list.
     """
     path, official = split_file(root, split), official_split(split)
     if split == ALL:
@@ -74,39 +74,39 @@ def listed_names(root: Path, split: str, folder: Path, places: Places) -> tuple[
     if path.is_file():
         return tuple(read_bytes(path).decode("utf-8-sig", errors="replace").split()), str(path)
     if official is None or "calibration" not in places:
-        raise InputError(f"{path} does not exist; write it, one frame a line, or take the split '{ALL}'.")
+        raise InputError(f"{path} does not exist; write it, one frame per line, or choose the split '{ALL}'.")
     return official, f"The official list of {split}"
 
 
 def split_file(root: Path, split: str) -> Path:
-    """The file that lists a split."""
+    """Return the file that lists a split."""
     return root / "ImageSets" / f"{split}.txt"
 
 
 def repeated_names(names: Sequence[str]) -> list[str]:
-    """One sentence without its end for every name that occurs more than once."""
+    """Return a clause for each name that occurs more than once."""
     return [f"frame {name} is listed {count} times" for name, count in Counter(names).items() if count > 1]
 
 
 def present_names(folder: Path, places: Places) -> tuple[str, ...]:
-    """Names of the frames that have any of their files, ascending."""
+    """Return the names of the frames that have any of their files, sorted."""
     paths = (path for patterns in places.values() for pattern in patterns for path in folder.glob(pattern.format("*")))
     return tuple(sorted({path.stem for path in paths}))
 
 
 def find_file(folder: Path, places: Sequence[str], name: str) -> Path | None:
-    """The first of the places where the frame's file is there."""
+    """Return the first of the places where the frame's file exists, or None."""
     return next((path for place in places if (path := folder / place.format(name)).is_file()), None)
 
 
 def present_files(name: str, *, folder: Path, places: Places) -> tuple[Path, ...]:
-    """The files of a frame that are there, one of every kind."""
+    """Return the files of a frame that exist, at most one of each kind."""
     found = (find_file(folder, paths, name) for paths in places.values())
     return tuple(path for path in found if path is not None)
 
 
 def missing_files(folder: Path, places: Places, names: Sequence[str]) -> list[str]:
-    """One sentence without its end for every kind of file that frames lack."""
+    """Return a clause for each kind of file that frames lack."""
     sentences = []
     for kind, paths in places.items():
         lacking = [name for name in names if find_file(folder, paths, name) is None]

@@ -1,4 +1,4 @@
-"""Worker processes that die: noticed, and said in one sentence."""
+"""Detection of worker processes that die."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from queue import Empty, SimpleQueue
 from typing import Any
 
-# Seconds between two looks at the workers, and until what a dead one had ready must have come.
-_LOOK, _PATIENCE = 0.1, 2.0
+# Seconds between two checks of the workers, and to wait for what a dead one had ready.
+_INTERVAL, _PATIENCE = 0.1, 2.0
 _DIED = "Worker process was terminated"
 
 
@@ -18,10 +18,10 @@ class WorkerError(RuntimeError):
 
 
 class Watched(Iterator[Any]):
-    """Grain's iterator, whose workers start after this was made; raises WorkerError for one that died.
+    """Grain's iterator, made before its workers start; raises WorkerError for a worker that died.
 
-    Grain says so itself, but for a worker that was killed while it wrote: for the rest it would wait for good. So a
-    thread waits for grain, and this looks after the workers meanwhile.
+    Grain reports dead workers, but waits forever for one that was killed while it wrote. Therefore a thread waits for
+    Grain, while this object checks the workers.
     """
 
     def __init__(self, batches: Any) -> None:
@@ -30,7 +30,7 @@ class Watched(Iterator[Any]):
         self._workers: set[Any] = set()
 
     def __next__(self) -> Any:
-        # A daemon: the program may end while grain still waits.
+        # A daemon, because the program may end while Grain still waits.
         threading.Thread(target=self._take, daemon=True).start()
         value, error = self._answer()
         if isinstance(error, RuntimeError) and str(error).startswith(_DIED):
@@ -48,14 +48,14 @@ class Watched(Iterator[Any]):
         try:
             self._answers.put((next(self._batches), None))
         except BaseException as error:
-            # It is raised where it is waited for.
+            # Raised by `__next__`.
             self._answers.put((None, error))
 
     def _answer(self) -> tuple[Any, BaseException | None]:
         dead = None
         while dead is None:
             try:
-                return self._answers.get(timeout=_LOOK)
+                return self._answers.get(timeout=_INTERVAL)
             except Empty:
                 dead = self._dead()
             finally:
@@ -66,17 +66,17 @@ class Watched(Iterator[Any]):
             for worker in self._workers:
                 worker.kill()
                 worker.join(_PATIENCE)
-            # To close it would wait for the same.
+            # Closing it would wait forever too.
             self._batches = None
             raise _died(dead) from None
 
     def _dead(self) -> int | None:
-        """Exit code of a worker that did not end well."""
+        """Return the exit code of a worker that failed, or None."""
         return next((worker.exitcode for worker in self._workers if worker.exitcode), None)
 
 
 def _died(code: int | str) -> WorkerError:
     return WorkerError(
-        f"A worker of the loader died (exit code {code}): memory may have run out, so take fewer workers or a smaller "
-        "batch, or the script that starts them lacks `if __name__ == '__main__':`; then go on from the last checkpoint."
+        f"A worker of the loader died (exit code {code}): memory may have run out, so use fewer workers or a smaller "
+        "batch, or the script lacks `if __name__ == '__main__':`; then resume from the last checkpoint."
     )

@@ -10,7 +10,7 @@ from mini_folders import NAMES, OBJECTS, object_points, write_custom, write_kitt
 
 from ciassd_jax.cli import main
 from ciassd_jax.data.folders import open_dataset
-from ciassd_jax.data.gt_sampling import fingerprint_of, open_database
+from ciassd_jax.data.gt_sampling import open_database
 from ciassd_jax.evaluation.check_scores import find_imperfect, score_truth
 from ciassd_jax.evaluation.dataset_check import check_dataset
 from ciassd_jax.formats.kitti_rows import read_rows, write_rows
@@ -113,7 +113,7 @@ def test_prepare_writes_the_database(run: Any, tmp_path: Path) -> None:
     assert result.code == 0
     path = tmp_path / "out" / "objects_all.bin"
     assert result.out == f"Wrote the objects of 3 frames to {path}.\n"
-    database = open_database(path, fingerprint_of(open_dataset(root, "all")))
+    database = open_database(path, open_dataset(root, "all"))
     assert len(database.objects) == 3 * len(OBJECTS)
     assert not (root / "training/velodyne_reduced").exists()
 

@@ -15,7 +15,7 @@ from small import random_variables
 from ciassd_jax import create_train_state, load_weights, save_weights
 from ciassd_jax.cli import main
 from ciassd_jax.config.presets import PRESETS
-from ciassd_jax.data.folders import database_path
+from ciassd_jax.data.gt_sampling import database_path
 from ciassd_jax.training import loop
 from ciassd_jax.training.loop import Fitted
 
@@ -57,7 +57,7 @@ def steps_of(workdir: Path) -> list[int]:
 def test_trains_and_goes_on(run: Callable[..., Run], root: Path, tmp_path: Path) -> None:
     first = run(workdir=tmp_path, **{"log-every": 2})
     assert first.code == 0, first.err
-    assert f"Collecting the objects to paste from 3 frames into {tmp_path}" in first.out
+    assert f"Collecting the objects for ground-truth sampling from 3 frames into {tmp_path}" in first.out
     assert not database_path(root, "train").exists()
     assert f"Trained 9 steps. Weights, metrics and evaluations are in {tmp_path}." in first.out
     assert steps_of(tmp_path) == [2, 4, 6, 8, 9]

@@ -17,11 +17,11 @@ from ciassd_jax.config.presets import tiny
 from ciassd_jax.data.augment import (
     accept_objects,
     add_object_noise,
+    add_sampled_objects,
     augment,
     flip,
     keep_targets,
     move_objects,
-    paste_objects,
     rotate,
     scale,
     scene_key,
@@ -45,7 +45,7 @@ CONFIG = replace(
 )
 compiled_augment = jax.jit(augment, static_argnames="config")
 accept = jax.jit(partial(accept_objects, gt_sampling_up_to=ROUND))
-paste = jax.jit(partial(paste_objects, gt_sampling_up_to=ROUND))
+add_objects = jax.jit(partial(add_sampled_objects, gt_sampling_up_to=ROUND))
 noise = jax.jit(partial(add_object_noise, config=AugmentationConfig(noise_tries=10)))
 compiled = {name: jax.jit(function) for name, function in (("flip", flip), ("rotate", rotate), ("scale", scale))}
 
@@ -204,7 +204,7 @@ def test_rounds_by_hand(places, wanted, expected):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_pasted_points_come_first_and_covered_ones_leave(seed):
+def test_added_points_come_first_and_covered_ones_leave(seed):
     scene, objects = random_scene(seed), random_objects(seed)
     accepted = np.flatnonzero(accept(scene.truth, objects))
     boxes = objects.boxes.to_array()
@@ -212,7 +212,7 @@ def test_pasted_points_come_first_and_covered_ones_leave(seed):
     covered = np.zeros(int(scene.cloud.count), bool)
     for slot in accepted:
         covered |= inside(real_points(scene), boxes[slot])
-    result = paste(scene, objects)
+    result = add_objects(scene, objects)
     np.testing.assert_array_equal(real_points(result), np.concatenate([comes, real_points(scene)[~covered]]))
     np.testing.assert_array_equal(real_boxes(result), np.concatenate([real_boxes(scene), boxes[accepted]]))
     labels = np.asarray(result.truth.label)[int(scene.truth.count) : int(result.truth.count)]
@@ -228,7 +228,7 @@ def test_an_object_without_a_free_box_stays_out_and_is_counted():
     cut = {"points_cut": 3, "boxes_cut": 1, "objects_cut": 2}
     scene = scene._replace(**{name: np.array(number, np.int32) for name, number in cut.items()})
     draws = draws_at([40, 50, 60, 70], (4, 0))._replace(cut=np.array(5, np.int32))
-    result = paste(scene, draws)
+    result = add_objects(scene, draws)
     assert (int(result.truth.count), int(result.boxes_cut), int(result.objects_cut)) == (BOXES, 1 + 3, 2 + 5)
     assert (int(result.cloud.count), int(result.points_cut)) == (10, 3)
     np.testing.assert_array_equal(real_points(result)[0], [40, 0, 0, 1])
@@ -237,7 +237,7 @@ def test_an_object_without_a_free_box_stays_out_and_is_counted():
 def test_points_over_capacity_are_cut_from_the_end():
     points = np.concatenate([np.full((POINTS, 3), -30), np.linspace(0, 1, POINTS)[:, None]], 1).astype(np.float32)
     scene = make_scene(points, np.zeros((0, 7), np.float32), [])
-    result = paste(scene, draws_at([5, 7, 9], (3, 0)))
+    result = add_objects(scene, draws_at([5, 7, 9], (3, 0)))
     assert (int(result.cloud.count), int(result.points_cut), int(result.truth.count)) == (POINTS, 3, 3)
     np.testing.assert_array_equal(real_points(result)[3:], points[:-3])
 
@@ -450,7 +450,7 @@ def test_room_for_more_changes_nothing():
 
 
 def with_switches(**switches: bool):
-    names = ("paste", "object_noise", "global_transform")
+    names = ("gt_sampling", "object_noise", "global_transform")
     augmentation = AugmentationConfig(**{name: switches.get(name, False) for name in names})
     return replace(CONFIG, data=replace(CONFIG.data, augmentation=augmentation))
 
@@ -464,17 +464,17 @@ def test_everything_off_only_orders_points_and_drops_what_is_no_target():
     np.testing.assert_array_equal(before, after)
 
 
-@pytest.mark.parametrize("switch", ["paste", "object_noise", "global_transform"])
+@pytest.mark.parametrize("switch", ["gt_sampling", "object_noise", "global_transform"])
 def test_one_switch_does_one_thing(switch):
     scene, objects, key = random_scene(3), random_objects(3), scene_key(0, 0, 0)
     result = compiled_augment(key, scene, objects, with_switches(**{switch: True}))
     plain = compiled_augment(key, scene, objects, with_switches())
     one = compiled_augment(key, scene, no_objects(), with_switches(**{switch: True}))
-    if switch == "paste":
+    if switch == "gt_sampling":
         assert int(result.truth.count) > int(plain.truth.count)
         assert_same(one, plain)
     else:
-        # What may be pasted plays no part.
+        # The sampled objects play no part.
         assert_same(one, result)
         assert int(result.cloud.count) == int(scene.cloud.count)
         assert np.abs(real_points(result) - real_points(plain)).max() > 0.1
@@ -483,10 +483,10 @@ def test_one_switch_does_one_thing(switch):
         background = ~np.any([inside(real_points(scene), box) for box in real_boxes(scene)], 0)
         rows = {row.tobytes() for row in real_points(result)}
         stays = [row.tobytes() in rows for row in real_points(scene)[background]]
-        assert np.mean(stays) > (0.5 if switch == "paste" else 0.999)
+        assert np.mean(stays) > (0.5 if switch == "gt_sampling" else 0.999)
 
 
-def test_without_slots_nothing_is_pasted():
+def test_without_slots_nothing_is_added():
     config = replace(CONFIG, classes=tuple(replace(one, gt_sampling_up_to=0) for one in CONFIG.classes))
     none = np.zeros(0, np.int32)
     objects = no_objects()._replace(
@@ -509,8 +509,8 @@ def test_augmented_scenes_keep_objects_apart(seed):
     scene, objects = random_scene(seed, number=10), random_objects(seed)
     result = compiled_augment(scene_key(seed, 0, 0), scene, objects, CONFIG)
     assert len(overlapping(real_boxes(result))) <= len(overlapping(real_boxes(scene)))
-    pasted = paste(scene, objects)
-    assert int(result.cloud.count) == int(pasted.cloud.count)
-    intensities = (np.sort(real_points(one)[:, 3]) for one in (result, pasted))
+    added = add_objects(scene, objects)
+    assert int(result.cloud.count) == int(added.cloud.count)
+    intensities = (np.sort(real_points(one)[:, 3]) for one in (result, added))
     np.testing.assert_array_equal(*intensities)
     assert np.isfinite(real_points(result)).all()

@@ -16,11 +16,12 @@ from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.data.gt_sampling import (
     build_database,
-    draw_objects,
     eligible_objects,
+    find_database,
     fingerprint_of,
     no_objects,
     open_database,
+    sample_objects,
 )
 from ciassd_jax.data.scenes import pad_frame
 from ciassd_jax.formats.errors import InputError
@@ -59,7 +60,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def database(path: Path):
-    return open_database(path, fingerprint_of(DATASET))
+    return open_database(path, DATASET)
 
 
 def test_it_holds_every_object(database):
@@ -88,37 +89,60 @@ def test_workers_map_the_file_themselves(database):
     np.testing.assert_array_equal(copy.points, database.points)
 
 
+def test_unpickling_does_not_read_the_data_set(path):
+    reads: list[str] = []
+
+    def read(name: str) -> Frame:
+        reads.append(name)
+        return make_frame(name)
+
+    text = pickle.dumps(open_database(path, replace(DATASET, read_frame=read)))
+    reads.clear()
+    assert len(pickle.loads(text).objects) == 12 * 4
+    assert not reads
+
+
+def test_a_database_is_found_or_built(path, tmp_path):
+    said: list[str] = []
+    other = replace(DATASET, names=DATASET.names[:3])
+    assert find_database(DATASET, [tmp_path / "none.bin", path], log=said.append).path == path
+    assert not said
+    assert find_database(other, [path, tmp_path / "built.bin"], log=said.append).path == tmp_path / "built.bin"
+    assert len(open_database(tmp_path / "built.bin", other).objects) == 3 * 4
+    assert len(said) == 1
+
+
 def test_a_data_set_without_objects(tmp_path):
     def empty(name: str) -> Frame:
         none = Boxes.from_array(np.zeros((0, 7)))
         return Frame(name, np.zeros((3, 4), np.float32), none, (), np.zeros(0, np.int64), None)
 
     dataset = Dataset(("0",), empty)
-    build_database(dataset, tmp_path / "objects.bin", progress=lambda frames: frames)
-    database = open_database(tmp_path / "objects.bin", fingerprint_of(dataset))
+    build_database(dataset, tmp_path / "objects.bin", track=lambda frames: frames)
+    database = open_database(tmp_path / "objects.bin", dataset)
     assert (len(database.objects), len(database.points)) == (0, 0)
-    drawn = draw_objects(database, (), seed=0, epoch=0, frame=0, config=CONFIG)
+    drawn = sample_objects(database, (), seed=0, epoch=0, frame=0, config=CONFIG)
     assert not drawn.valid.any()
     np.testing.assert_array_equal(drawn.wanted, [4, 2])
 
 
 def test_a_file_that_is_not_this_database_is_refused(path, tmp_path):
-    content, right = path.read_bytes(), fingerprint_of(DATASET)
+    content = path.read_bytes()
     bad = tmp_path / "bad.bin"
     for cut in (0, 5, 16, 20, 1000, len(content) - 8, len(content) - 1):
         bad.write_bytes(content[:cut])
-        with pytest.raises(InputError, match=r"bad\.bin is (no ground-truth|damaged).*ciassd data prepare`\.$"):
-            open_database(bad, right)
+        with pytest.raises(InputError, match=r"bad\.bin is (not a ground-truth|damaged).*ciassd data prepare`\.$"):
+            open_database(bad, DATASET)
     foreign_footer = content[:16] + b"[1]" + (3).to_bytes(8, "little")
     more, less = content[:200] + bytes(16) + content[200:], content[:200] + content[216:]
     for foreign in (b"PK" + content[2:], content + b"x", foreign_footer, more, less):
         bad.write_bytes(foreign)
         with pytest.raises(InputError, match="build it again"):
-            open_database(bad, right)
+            open_database(bad, DATASET)
     with pytest.raises(InputError, match="does not exist"):
-        open_database(tmp_path / "none.bin", right)
+        open_database(tmp_path / "none.bin", DATASET)
     with pytest.raises(InputError, match=r"objects\.bin is stale.*build it again"):
-        open_database(path, fingerprint_of(replace(DATASET, names=DATASET.names[1:])))
+        open_database(path, replace(DATASET, names=DATASET.names[1:]))
 
 
 def test_a_failed_build_leaves_the_old_file(path):
@@ -171,7 +195,7 @@ def names_of(database, objects) -> list[tuple[int, int]]:
 
 
 def draw(database, names=("Car", "Van", "Tram"), config=CONFIG, **numbers):
-    return draw_objects(database, names, **{"seed": 0, "epoch": 0, "frame": 0} | numbers, config=config)
+    return sample_objects(database, names, **{"seed": 0, "epoch": 0, "frame": 0} | numbers, config=config)
 
 
 def test_drawn_objects_have_their_class_and_points(database):
@@ -226,9 +250,9 @@ def test_filters(database):
     assert len(eligible_objects(database, replace(car_class, name="Tram"), difficulty_filter=True)) == 0
 
 
-def test_enough_objects_or_no_pasting_draw_nothing(database):
+def test_enough_objects_or_no_sampling_draw_nothing(database):
     many = draw(database, ("Car",) * 5 + ("Cyclist",) * 2)
-    off = replace(CONFIG, data=replace(CONFIG.data, augmentation=AugmentationConfig(paste=False)))
+    off = replace(CONFIG, data=replace(CONFIG.data, augmentation=AugmentationConfig(gt_sampling=False)))
     for objects in (many, draw(database, config=off), no_objects(CONFIG)):
         assert not objects.valid.any()
         assert not objects.points.any()
@@ -255,28 +279,28 @@ def test_objects_whose_points_do_not_fit_are_counted(database):
 
 @pytest.mark.reference
 def test_real_frames(shared, tmp_path):
-    """Objects of twelve KITTI frames pasted into them: no collision, and every pasted box still has its points."""
+    """Objects of twelve KITTI frames added to them: no collision, and every added box still has its points."""
     dataset = open_dataset(shared / "kitti", "train")
     dataset = replace(dataset, names=dataset.names[:12])
     build_database(dataset, tmp_path / "objects.bin")
-    database = open_database(tmp_path / "objects.bin", fingerprint_of(dataset))
+    database = open_database(tmp_path / "objects.bin", dataset)
     config = replace(car(), data=replace(car().data, augmentation=AugmentationConfig(object_noise=False)))
     run = jax.jit(augment, static_argnames="config")
-    pasted = 0
+    added = 0
     for index in range(12):
         frame = dataset.read(index)
         scene = pad_frame(frame, index, config)
-        objects = draw_objects(database, frame.names, seed=0, epoch=0, frame=index, config=config)
+        objects = sample_objects(database, frame.names, seed=0, epoch=0, frame=index, config=config)
         result = run(scene_key(0, 0, index), scene, objects, config)
         assert (objects.cut, result.points_cut, result.boxes_cut) == (0, 0, 0)
         count = int(result.truth.count)
         boxes = np.asarray(result.truth.boxes.to_array())[:count]
         points = np.asarray(result.cloud.points)[: int(result.cloud.count)]
         targets = sum(name in ("Car", "Van") for name in frame.names)
-        pasted += count - targets
+        added += count - targets
         assert count >= 10 or objects.wanted[0] > objects.valid[:15].sum()
         polygons = [footprint(box) for box in boxes]
         for slot in range(targets, count):
             assert all(polygons[slot].intersection(polygons[other]).area < 1e-4 for other in range(slot))
             assert inside(points, boxes[slot]).sum() >= 4
-    assert pasted > 60
+    assert added > 60

@@ -14,17 +14,16 @@ import numpy as np
 import pytest
 from mini_folders import NAMES, write_kitti, write_split
 
-from ciassd_jax import Config, Scene, car_lite, make_batches, one_pass, open_dataset, tiny
+from ciassd_jax import Config, Scene, car_lite, make_batches, open_dataset, tiny
 from ciassd_jax.config import AugmentationConfig, DataConfig
 from ciassd_jax.data.augment import augment, keep_targets, scene_key
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.gt_sampling import (
     ObjectDatabase,
     build_database,
-    draw_objects,
-    fingerprint_of,
     no_objects,
     open_database,
+    sample_objects,
 )
 from ciassd_jax.data.loader import Batches, LoaderState, Rows, Stream, epoch_order, finish_scenes
 from ciassd_jax.data.scenes import pad_frame
@@ -40,7 +39,7 @@ def open_mini(root: Path) -> tuple[Dataset, ObjectDatabase]:
     write_split(write_kitti(root), "mine", *NAMES)
     dataset = open_dataset(root, "mine")
     build_database(dataset, root / "objects.bin")
-    return dataset, open_database(root / "objects.bin", fingerprint_of(dataset))
+    return dataset, open_database(root / "objects.bin", dataset)
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +81,14 @@ def test_a_row_is_its_frame_augmented_by_seed_epoch_and_frame(mini, expected: li
     for position in range(5):
         epoch, index = position // 3, int(expected[position // 2].frame[position % 2])
         frame = dataset.read(index)
-        objects = draw_objects(database, frame.names, seed=3, epoch=epoch, frame=index, config=CONFIG)
+        objects = sample_objects(database, frame.names, seed=3, epoch=epoch, frame=index, config=CONFIG)
         scene = run(scene_key(3, epoch, index), pad_frame(frame, index, CONFIG), objects, CONFIG)
         row = jax.tree.map(lambda leaf, position=position: leaf[position % 2], expected[position // 2])
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=2e-5), row, scene)
+
+
+def test_the_batch_size_is_the_schedule_s(mini) -> None:
+    assert make(mini, batch_size=None).state.batch_size == CONFIG.schedule.batch_size
 
 
 def test_batches_are_on_the_device_in_fixed_shapes(expected: list[Scene]) -> None:
@@ -111,7 +114,7 @@ def test_without_augmentation_frames_only_lose_what_is_no_target(mini) -> None:
             jax.tree.map(lambda a, b, row=row: np.testing.assert_array_equal(a[row], b), batch, scene)
 
 
-def test_without_a_database_nothing_is_pasted(mini) -> None:
+def test_without_a_database_no_object_is_added(mini) -> None:
     rows = Rows(Stream(mini[0], CONFIG, 0, True), 1)
     chex.assert_trees_all_equal(rows[0].objects, no_objects(CONFIG))
     (batch,) = take(make(mini, database=None), 1)
@@ -120,10 +123,10 @@ def test_without_a_database_nothing_is_pasted(mini) -> None:
 
 def test_everything_cut_is_counted(mini) -> None:
     dataset, database = mini
-    only_paste = AugmentationConfig(object_noise=False, global_transform=False)
-    narrow = replace(CONFIG, data=DataConfig(300, 2, max_gt_sampling_points=100, augmentation=only_paste))
+    only_sampling = AugmentationConfig(object_noise=False, global_transform=False)
+    narrow = replace(CONFIG, data=DataConfig(300, 2, max_gt_sampling_points=100, augmentation=only_sampling))
     frame = dataset.read(0)
-    objects = draw_objects(database, frame.names, seed=0, epoch=0, frame=0, config=narrow)
+    objects = sample_objects(database, frame.names, seed=0, epoch=0, frame=0, config=narrow)
     with make_batches(replace(dataset, names=NAMES[:1]), narrow, seed=0, batch_size=1, database=database) as batches:
         batch = next(batches)
     assert objects.cut > 0
@@ -164,7 +167,7 @@ def test_workers_change_nothing_and_resume_each_other(mini, expected: list[Scene
 
 @pytest.mark.parametrize("change", [{"seed": 4}, {"batch_size": 3}, {"database": None}])
 def test_a_state_of_another_stream_is_refused(mini, change: dict) -> None:
-    with pytest.raises(ValueError, match=r"^The loader's state is of another stream \(\w+ \d+ instead of \d+\); go on"):
+    with pytest.raises(ValueError, match=r"^The loader's state is of another stream \(\w+ \d+ instead of \d+\); resume"):
         make(mini, **change).set_state(make(mini).state)
     fewer = replace(mini[0], names=NAMES[:2])
     with pytest.raises(ValueError, match=r"frames 3 instead of 2, checksum \d+ instead"):
@@ -183,22 +186,8 @@ def test_processes_share_the_same_batches(mini) -> None:
     assert make(mini, shard=(1, 2)).state == make(mini).state
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_one_pass_is_in_order_and_ends_with_empty_scenes(mini, workers: int) -> None:
-    dataset = replace(mini[0], names=(*NAMES, NAMES[0], NAMES[1]))
-    with one_pass(dataset, CONFIG, batch_size=3, workers=workers) as batches:
-        scenes = list(batches)
-        assert next(batches, None) is None
-    frames = np.concatenate([scene.frame for scene in scenes]).tolist()
-    assert frames == [0, 1, 2, 3, 4, -1]
-    assert [int(count) for count in scenes[1].cloud.count] == [len(dataset.read(i).points) for i in (3, 4)] + [0]
-    assert int(scenes[1].truth.count[2]) == 0
-    assert not scenes[1].cloud.points[2].any()
-    np.testing.assert_array_equal(scenes[0].cloud.points[0], scenes[1].cloud.points[0])
-
-
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_bad_file_is_named_and_can_be_mended(tmp_path: Path, workers: int) -> None:
+def test_a_bad_file_is_named_and_can_be_repaired(tmp_path: Path, workers: int) -> None:
     mini = open_mini(tmp_path)
     bad = tmp_path / "training/velodyne/000001.bin"
     content = bad.read_bytes()
@@ -280,7 +269,7 @@ def test_numbers_that_fit_no_stream_are_refused(mini, change: dict, message: str
 
 def test_an_empty_data_set_is_refused(mini) -> None:
     with pytest.raises(ValueError, match="has no frames"):
-        one_pass(replace(mini[0], names=()), CONFIG, batch_size=1)
+        make_batches(replace(mini[0], names=()), CONFIG, seed=0)
 
 
 @pytest.mark.reference
@@ -288,8 +277,6 @@ def test_real_frames_fit(shared: Path) -> None:
     """Nothing of the reference data's frames is over the capacities of the CPU's preset."""
     config: Config = car_lite()
     dataset = open_dataset(shared / "kitti", "val")
-    with one_pass(dataset, config, batch_size=9) as batches:
-        scenes = list(batches)
-    assert np.concatenate([scene.frame for scene in scenes]).tolist() == list(range(len(dataset)))
+    scenes = [pad_frame(dataset.read(index), index, config) for index in range(len(dataset))]
     cut = [np.sum([scene.points_cut, scene.boxes_cut, scene.objects_cut]) for scene in scenes]
     assert not np.any(cut)

@@ -91,6 +91,6 @@ def test_what_does_not_fit_is_counted() -> None:
 def test_a_box_without_a_size_is_refused(size: float) -> None:
     frame = make_frame()
     frame.boxes.size[2, 1] = size
-    message = rf"Frame 000007: object 2 \(Truck\) has the size .* x {size:g} x .*; mend or remove its line"
+    message = rf"Frame 000007: object 2 \(Truck\) has the size .* x {size:g} x .*; correct or remove its line"
     with pytest.raises(InputError, match=message):
         pad_frame(frame, 0, tiny())

@@ -56,19 +56,19 @@ def test_a_split_file_wins_over_the_official_list(tmp_path: Path) -> None:
     ("split", "names", "message"),
     [
         ("train", ("000001", "000000", "000001"), r"train\.txt: frame 000001 is listed 2 times; list it once\."),
-        ("train", (), r"train\.txt names no frame; check the path, or list them one a line\."),
+        ("train", (), r"train\.txt names no frame; check the path, or list them, one per line\."),
         (
             "mine",
             ("000001", "000002", "000003"),
             r"mine\.txt: 2 of 3 frames have no cloud \S+velodyne_reduced/NAME\.bin or \S+velodyne/NAME\.bin "
-            r"\(000002, 000003\); copy them, or list those you have in \S+mine\.txt\.",
+            r"\(000002, 000003\); copy them, or list the others in \S+mine\.txt\.",
         ),
         (
             "val",
             None,
             r"The official list of val: 3767 of 3769 frames have no cloud .* \(000002, 000005, 000006, \.\.\.\)",
         ),
-        ("other", None, r"other\.txt does not exist; write it, one frame a line, or take the split 'all'\."),
+        ("other", None, r"other\.txt does not exist; write it, one frame per line, or choose the split 'all'\."),
     ],
 )
 def test_a_split_that_cannot_be_read_gets_one_sentence(

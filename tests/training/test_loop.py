@@ -25,7 +25,7 @@ from mini_training import (
 from small import random_variables
 
 from ciassd_jax import create_train_state, load_weights, open_dataset
-from ciassd_jax.data.folders import find_database
+from ciassd_jax.data.gt_sampling import find_database
 from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import InputError
 from ciassd_jax.model.network import variables_of
@@ -259,9 +259,9 @@ def test_the_database_is_found_or_built(root: Path, tmp_path: Path) -> None:
     dataset, said = open_dataset(root, "train"), []
     stale = tmp_path / "stale.bin"
     stale.write_bytes(b"no database")
-    built = find_database(dataset, [stale, tmp_path / "built.bin"], say=said.append)
+    built = find_database(dataset, [stale, tmp_path / "built.bin"], log=said.append)
     assert (built.path, len(said)) == (tmp_path / "built.bin", 1)
-    again = find_database(dataset, [stale, tmp_path / "built.bin"], say=said.append)
+    again = find_database(dataset, [stale, tmp_path / "built.bin"], log=said.append)
     assert (again.path, len(said)) == (tmp_path / "built.bin", 1)
     assert stale.read_bytes() == b"no database"
 
