@@ -1,7 +1,7 @@
-"""Synthetic street scenes, as a 64-beam LiDAR would see them, with KITTI's labels.
+"""Synthetic street scenes as a 64-beam LiDAR sees them, with KITTI's labels.
 
-`open_synthetic` is a data set that is simulated as it is read, `write_synthetic` a folder in KITTI's layout;
-`simulate` is the pure function beneath both: from a key to a cloud and its objects.
+`open_synthetic` returns a data set that is simulated as it is read, and `write_synthetic` writes a folder in KITTI's
+layout. Both call `simulate`, the pure function from a random key to a cloud and its objects.
 """
 
 from ciassd_jax.simulation.sensor import Lidar

@@ -1,8 +1,8 @@
-"""Which solid each ray of the sensor meets first.
+"""Ray casting: the first solid that each ray of the sensor hits.
 
-The rays lie in a grid of rows (beams) and columns (azimuths), which is cut into square tiles. Every solid is tried with
-the rays of the tiles that its outline touches and no others: pairs of a solid and a tile fill a list of fixed capacity,
-nearest solids first, and the best of a tile's pairs wins.
+The rays form a grid of rows (beams) and columns (azimuths), divided into square tiles. Each solid is tested against the
+rays of those tiles only that its outline overlaps. Pairs of a solid and a tile fill a list of fixed capacity, nearest
+solids first, and each ray keeps the nearest hit among the pairs of its tile.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from jaxtyping import Float, Int
 from ciassd_jax.simulation.solids import Solids, cross, extent, incidence
 from ciassd_jax.types import Array
 
-# Rays of a tile along each axis; columns are as many as a vector register holds.
+# Rays of a tile along each axis; 16 columns fill a vector register.
 TILE = 16
-# A distance in this many steps of a metre and a solid's number share an int32, so that the nearer one is the smaller.
+# A distance in steps per metre and the index of a solid are packed into one int32, whose minimum is the nearest solid.
 _STEPS, _BITS = 8000, 11
 MAX_SOLIDS = 2**_BITS
 _FARTHEST = (2**31 - 1) / MAX_SOLIDS / _STEPS
 _NONE = 2**31 - 1
-# The sensor looks out of what it stands in.
+# Rays start at this distance in metres, so that a solid around the sensor does not stop them.
 _NEAREST = 0.3
-# What lies so many metres before a box still belongs to it.
+# A ray that ends up to this many metres before a box still reaches it.
 _SLACK = 0.1
 
 
 class Rays(NamedTuple):
-    """Directions: azimuths in radians, ascending and evenly round the circle, and tangents of elevation, falling."""
+    """Directions: evenly spaced azimuths of a full circle in radians, ascending; tangents of elevation, descending."""
 
     azimuth: Float[Array, " columns"]
     tangent: Float[Array, " rows"]
 
 
 class Hits(NamedTuple):
-    """What each ray meets first: its horizontal distance in metres, the cosine of incidence, and which solid it is.
+    """The first hit of each ray: horizontal distance in metres, cosine of incidence, and index of the solid.
 
-    The distance is inf and `solid` -1 for none. `dropped` counts pairs of a solid and a tile over capacity: there
-    farther solids are not seen.
+    Without a hit the distance is inf and `solid` is -1. `dropped` counts pairs of a solid and a tile over capacity:
+    parts of the farthest solids that are not seen.
     """
 
     distance: Float[Array, "rows columns"]
@@ -50,7 +50,7 @@ class Hits(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """Solids and the tiles they may be seen in; a slot without a pair has the number of tiles as its tile."""
+    """Solids and tiles that may contain them; the tile of an empty slot is the number of tiles."""
 
     solid: Int[Array, " pairs"]
     row: Int[Array, " pairs"]
@@ -62,10 +62,10 @@ class _Pairs(NamedTuple):
 def cast(
     solids: Solids, depth: Float[Array, " S"], rays: Rays, stray: Float[Array, "rows columns"], capacity: int
 ) -> Hits:
-    """What every ray meets first among S solids.
+    """Return the first hit of every ray among S solids.
 
-    A ray goes `stray * depth` metres into a solid before it is thrown back, and passes if it leaves sooner. Rows and
-    columns are whole tiles, S is at most `MAX_SOLIDS`; `capacity` is the number of pairs.
+    A ray travels `stray * depth` metres into a solid before it is reflected, and passes through if it leaves the solid
+    sooner. Rows and columns must be multiples of `TILE` and S at most `MAX_SOLIDS`; `capacity` is the number of pairs.
     """
     rows, columns = rays.tangent.size // TILE, rays.azimuth.size // TILE
     assert (rows * TILE, columns * TILE) == (rays.tangent.size, rays.azimuth.size)
@@ -73,7 +73,7 @@ def cast(
     order = jnp.argsort(jnp.where(solids.present, jnp.sum(solids.origin[:, :2] ** 2, -1), jnp.inf))
     sorted_solids = jax.tree.map(lambda leaf: leaf[order], solids)
     pairs = _pair(sorted_solids, rays, capacity)
-    keys = _try(sorted_solids, depth[order], rays, _tiles(stray), pairs)
+    keys = _test(sorted_solids, depth[order], rays, _tiles(stray), pairs)
     best = jnp.full((rows * columns, TILE, TILE), _NONE, jnp.int32).at[pairs.tile].min(keys, mode="drop")
     best = best.reshape(rows, columns, TILE, TILE).transpose(0, 2, 1, 3).reshape(rows * TILE, columns * TILE)
     return _finish(best, order, solids, depth, rays, stray, pairs.dropped)
@@ -82,7 +82,7 @@ def cast(
 def count_rays(
     solids: Solids, rays: Rays, distance: Float[Array, "rows columns"], capacity: int
 ) -> tuple[Int[Array, " S"], Int[Array, " S"], Int[Array, ""]]:
-    """How many rays go through each solid, how many of them get there, and how many pairs were over capacity.
+    """Return the number of rays through each solid, the number of these that reach it, and the dropped pairs.
 
     `distance` is the horizontal distance in metres at which each ray ends.
     """
@@ -91,8 +91,8 @@ def count_rays(
     real = (pairs.tile < (rays.tangent.size // TILE) * (rays.azimuth.size // TILE))[:, None, None]
     through = (enter < leave) & (leave > 0) & real
     ends = _tiles(distance)[jnp.minimum(pairs.tile, _tiles(distance).shape[0] - 1)]
-    # Both counts in one number, and a product with ones (exact for so few rays) in place of a sum, which XLA would fuse
-    # with all of `cross` and not vectorise.
+    # Pack both counts into one number, and multiply with ones (exact for this few rays) instead of summing, which XLA
+    # would fuse with all of `cross` and not vectorise.
     weight = 2 * TILE * TILE
     value = jnp.where(through, jnp.where(ends > enter - _SLACK, weight + 1.0, 1.0), 0.0)
     both = (value.reshape(capacity, -1) @ jnp.ones(TILE * TILE)).astype(jnp.int32)
@@ -106,21 +106,21 @@ def _tiles(grid: Float[Array, "rows columns"]) -> Float[Array, "tiles tile_rows 
 
 
 def _aim(solids: Solids, rays: Rays, pairs: _Pairs) -> tuple[Solids, tuple[Array, Array, Array]]:
-    """The solid of each pair and the directions of the tile's rays in its frame, to be broadcast."""
+    """The solid of each pair and the directions of the tile's rays in its frame, ready to broadcast."""
     chosen = jax.tree.map(lambda leaf: leaf[pairs.solid][:, None, None], solids)
     azimuth = rays.azimuth.reshape(-1, TILE)[pairs.column] - chosen.yaw[:, 0]
     tangent = rays.tangent.reshape(-1, TILE)[pairs.row]
     return chosen, (jnp.cos(azimuth)[:, None, :], jnp.sin(azimuth)[:, None, :], tangent[:, :, None])
 
 
-def _try(
+def _test(
     solids: Solids,
     depth: Float[Array, " S"],
     rays: Rays,
     stray: Float[Array, "tiles tile_rows tile_columns"],
     pairs: _Pairs,
 ) -> Int[Array, "pairs tile_rows tile_columns"]:
-    """For every ray of every pair a number that grows with the distance and holds the solid; `_NONE` for a miss."""
+    """The packed distance and solid of every ray of every pair; `_NONE` for a miss."""
     enter, leave = cross(*_aim(solids, rays, pairs))
     inward = depth[pairs.solid][:, None, None] * stray[jnp.minimum(pairs.tile, len(stray) - 1)]
     distance = jnp.maximum(enter, _NEAREST) + inward
@@ -138,7 +138,7 @@ def _finish(
     stray: Float[Array, "rows columns"],
     dropped: Int[Array, ""],
 ) -> Hits:
-    """The exact distance and the cosine of incidence from the winners' numbers."""
+    """Unpack the nearest solids, and compute the exact distances and the cosines of incidence."""
     hit = best != _NONE
     winner = order[jnp.where(hit, best % MAX_SOLIDS, 0)]
     chosen = jax.tree.map(lambda leaf: leaf[winner], solids)
@@ -150,7 +150,7 @@ def _finish(
 
 
 def _pair(solids: Solids, rays: Rays, capacity: int) -> _Pairs:
-    """The tiles that the solids' outlines touch."""
+    """Pair each solid with the tiles that its outline overlaps."""
     rows, columns = rays.tangent.size // TILE, rays.azimuth.size // TILE
     first_row, last_row, first_column, last_column = _outline(solids, rays)
     high = jnp.maximum(last_row // TILE - first_row // TILE + 1, 0)
@@ -170,7 +170,7 @@ def _pair(solids: Solids, rays: Rays, capacity: int) -> _Pairs:
 
 
 def _outline(solids: Solids, rays: Rays) -> tuple[Array, Array, Array, Array]:
-    """First and last row, first and last column (not yet wrapped) that may meet each solid."""
+    """First and last row, first and last column (not yet wrapped) of the rays that may hit each solid."""
     front, rear, side, high, low = extent(solids)
     cosine, sine = jnp.cos(solids.yaw), jnp.sin(solids.yaw)
     x, y, z = solids.origin[:, 0], solids.origin[:, 1], solids.origin[:, 2]
@@ -181,7 +181,7 @@ def _outline(solids: Solids, rays: Rays) -> tuple[Array, Array, Array, Array]:
     middle = jnp.arctan2(corner_y.mean(-1), corner_x.mean(-1))
     turn = jnp.arctan2(corner_y, corner_x) - middle[:, None]
     turn = turn - jnp.round(turn / (2 * jnp.pi)) * (2 * jnp.pi)
-    # The sensor's place in the solid's frame, and how far it is from the footprint.
+    # The position of the sensor in the solid's frame, and its distance from the footprint.
     u, v = -(x * cosine + y * sine), x * sine - y * cosine
     beside = jnp.hypot(jnp.maximum(jnp.maximum(u - front, -rear - u), 0), jnp.maximum(jnp.abs(v) - side, 0))
     over = beside <= 0
@@ -193,7 +193,7 @@ def _outline(solids: Solids, rays: Rays) -> tuple[Array, Array, Array, Array]:
     last_row = jnp.searchsorted(-rays.tangent, -lowest, side="right") - 1
     step = 2 * jnp.pi / rays.azimuth.size
     start = (middle - rays.azimuth[0]) / step
-    # A hair wider, for the rounding of the angles.
+    # A small margin covers the rounding of the angles.
     first = jnp.ceil(start + jnp.where(over, -jnp.pi, turn.min(-1)) / step - 0.01)
     last = jnp.floor(start + jnp.where(over, jnp.pi, turn.max(-1)) / step + 0.01)
     return first_row, last_row, first.astype(jnp.int32), last.astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""What is no target: trees, poles, hedges, walls, houses, bushes, fences, containers; one or two solids each."""
+"""Objects without labels, of one or two solids each: trees, poles, hedges, walls, houses, bushes, containers."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ TREE, POLE, HEDGE, WALL, HOUSE, BUSH, CONTAINER = range(7)
 
 
 class _Kind(NamedTuple):
-    """Slots on both sides, sizes (length, width, height) from low to high, and how far from the pavement, in metres.
+    """A kind of clutter: slots on both sides, range of sizes (length, width, height), distances from the pavement.
 
-    Where something stands is `near` plus up to `jitter` for the scene plus up to `far`, mostly little of it.
+    All in metres. An object stands `near` from the pavement, plus up to `jitter`, drawn once per scene, plus up to
+    `far`, of which small values are more likely.
     """
 
     kind: int
@@ -47,7 +48,7 @@ _BACK, _STREET = -55.0, 130.0
 
 
 def draw_clutter(chance: Chance, of_kinds: Chance, ground: Ground) -> Slots:
-    """Clutter on both sides of the road, in the order in which it gives way."""
+    """Draw clutter on both sides of the road; of two that collide, the later one is removed."""
     index = np.repeat(np.arange(len(_KINDS)), [kind.slots for kind in _KINDS])
     table = [_KINDS[i] for i in index]
     low, high = (jnp.array([getattr(kind, name) for kind in table]) for name in ("low", "high"))
@@ -57,7 +58,7 @@ def draw_clutter(chance: Chance, of_kinds: Chance, ground: Ground) -> Slots:
     side = np.tile([1, -1], len(table) // 2)
     part = jnp.stack([chance.uniform() for _ in range(3)], -1) ** 1.5
     size = low + (high - low) * part
-    # The near side of long things is at the distance drawn, trees and poles have their middle there.
+    # The distance drawn is that of the near side, but for poles and trees that of the centre.
     reach = np.array([kind.kind not in (POLE, TREE) for kind in table]) * size[:, 1] / 2
     away = ground.half_width + jnp.maximum(ground.pavement + near + jitter * of_kinds.uniform()[index], 0.3)
     away = away + far * chance.uniform() ** 2 + reach
@@ -72,7 +73,7 @@ def draw_clutter(chance: Chance, of_kinds: Chance, ground: Ground) -> Slots:
 
 
 def clutter_solids(slots: Slots, ground: Ground) -> Solids:
-    """Two solids for each slot."""
+    """Return the solids, two for each slot."""
     assert slots.size is not None
     x, y = road_to_lidar(ground, slots.u, slots.v)
     base = jnp.stack([x, y, ground_height(ground, x, y) - 0.1], -1)
@@ -83,7 +84,7 @@ def clutter_solids(slots: Slots, ground: Ground) -> Solids:
 
 
 def _shape(size: Float[Array, " 3"], kind: Array) -> Solids:
-    """The solids of every kind, of which one is taken."""
+    """Build the solids of every kind and select one."""
     length, width, height = size
     none = block((0, 0, 0), (0, 0, 0), 0)._replace(present=jnp.array(False))
     upright = (0, 0, height / 2)

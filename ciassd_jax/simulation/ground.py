@@ -1,6 +1,6 @@
-"""The ground of a synthetic scene: a road with kerbs, a crossing street, pavements and what lies beyond.
+"""The ground of a synthetic scene: a road with kerbs, a crossing street, pavements and the area beyond.
 
-Analytic: a paraboloid, which is the road, and the same surface raised by the kerb where there is no road.
+The road is a paraboloid, and the rest is the same surface raised by the kerb, so that rays are cast analytically.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from ciassd_jax.types import Array
 class Ground(NamedTuple):
     """z = -sensor_height + slope . (x, y) + bend (x^2 + y^2) / 2 on the road, `kerb` metres more elsewhere.
 
-    The road runs along u: (u, v) are (x, y) turned by -yaw. It holds |v - middle| < half_width; a crossing street holds
-    |u - crossing| < crossing_half. Pavements reach `pavement` metres from the road; beyond is grass or more paving,
-    uneven by `roughness` (standard deviation, metres). `shade` is a factor on all reflectances of the ground. A scene
-    without a crossing has it out of sight.
+    The road runs along u, where (u, v) are (x, y) rotated by -yaw. It covers |v - middle| < half_width, and a crossing
+    street covers |u - crossing| < crossing_half; in a scene without a crossing it is out of sight. Pavements extend
+    `pavement` metres from the road. `beyond` is the material of the area behind them, grass or paving, which is uneven
+    by `roughness` (standard deviation, metres). `shade` is a factor on all reflectances of the ground.
     """
 
     sensor_height: Float[Array, "*s"]
@@ -39,13 +39,13 @@ class Ground(NamedTuple):
 
 
 def road_to_lidar(ground: Ground, u: Array, v: Array) -> tuple[Array, Array]:
-    """Places (u, v) along and across the road as (x, y)."""
+    """Return (x, y) of positions (u, v) along and across the road."""
     cosine, sine = jnp.cos(ground.yaw), jnp.sin(ground.yaw)
     return u * cosine - v * sine, u * sine + v * cosine
 
 
 def ground_height(ground: Ground, x: Array, y: Array) -> Array:
-    """z of the ground at (x, y), the kerb included."""
+    """Return z of the ground at (x, y), with the kerb."""
     plane = ground.slope[0] * x + ground.slope[1] * y + ground.bend * (x**2 + y**2) / 2 - ground.sensor_height
     return plane + jnp.where(_on_road(ground, x, y), 0.0, ground.kerb)
 
@@ -56,15 +56,15 @@ def cast_ground(
     tangent: Float[Array, " rows"],
     uneven: Float[Array, "rows columns"],
 ) -> tuple[Array, Array, Array]:
-    """Where rays meet the ground: horizontal distances (inf for never), cosines of incidence, materials.
+    """Return where rays hit the ground: horizontal distances (inf for none), cosines of incidence, materials.
 
-    `uneven` are standard normal numbers for the height of rough ground.
+    `uneven` holds standard normal numbers for the height of rough ground.
     """
     x, y = jnp.cos(azimuth)[None], jnp.sin(azimuth)[None]
     fall = ground.slope[0] * x + ground.slope[1] * y - tangent[:, None]
     road = _meet(ground, ground.sensor_height, fall)
     raised = _meet(ground, ground.sensor_height - ground.kerb, fall)
-    # A ray that is above a pavement's height over the road and below it when it gets there meets the kerbstone.
+    # A ray that hits neither the road nor the raised surface hits the kerbstone between them.
     on_road = _on_road(ground, road * x, road * y)
     off_road = ~_on_road(ground, raised * x, raised * y)
     distance = jnp.where(off_road, raised, jnp.where(on_road, road, (raised + road) / 2))
@@ -81,7 +81,7 @@ def _height_at(ground: Ground, off_road: Bool[Array, "rows columns"]) -> Array:
 
 
 def _meet(ground: Ground, height: Array, fall: Array) -> Array:
-    """Where rays that fall `fall` per metre meet the paraboloid so far below: bend/2 t^2 + fall t = height."""
+    """Where rays that fall `fall` per metre hit the surface `height` below: bend/2 t^2 + fall t = height."""
     root = jnp.sqrt(jnp.maximum(fall**2 + 2 * ground.bend * height, 0.0))
     never = (fall**2 + 2 * ground.bend * height < 0) | (fall + root <= 1e-4)
     return jnp.where(never, jnp.inf, 2 * height / jnp.maximum(fall + root, 1e-4))
@@ -100,6 +100,6 @@ def _beyond(ground: Ground, x: Array, y: Array) -> Array:
 
 
 def _along_and_across(ground: Ground, x: Array, y: Array) -> tuple[Array, Array]:
-    """A place in the directions of the road."""
+    """Positions (x, y) as (u, v)."""
     cosine, sine = jnp.cos(ground.yaw), jnp.sin(ground.yaw)
     return x * cosine + y * sine, y * cosine - x * sine

@@ -1,6 +1,6 @@
-"""What stands where: a street scene drawn at random, as solids and labelled objects.
+"""The layout of a random street scene, as solids and labelled objects.
 
-Places are drawn along the road (u) and across it (v); what would stand in something drawn before stays away.
+Positions are drawn along the road (u) and across it (v). An object that would collide with an earlier one is removed.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from ciassd_jax.simulation.slots import Chance, Slots, deal, join, keep_apart
 from ciassd_jax.simulation.solids import Solids, place, solid, stack
 from ciassd_jax.types import Array, Boxes
 
-# Slots: of a lane, of all lanes; of parked cars, yards, the crossing street and people, half of them on either side.
+# Slots of one lane and of all lanes, then of parked cars, yards, the crossing street and people, half on each side.
 _LANE, _TRAFFIC, _PARKED, _YARDS, _CROSSING, _PEOPLE = 8, 48, 52, 16, 6, 16
 _OBJECTS = _TRAFFIC + _PARKED + _YARDS + _CROSSING + _PEOPLE
 _SIDES = (1, -1)
 _LANE_WIDTH = 3.3
 _START, _END = -60.0, 78.0
-# A crossing is there if it is nearer.
+# The position of the crossing street in a scene without one, in metres.
 _NOWHERE = 1e4
 
 
 class Objects(NamedTuple):
-    """Objects that labels are made of; those that are not `present` have no size."""
+    """Objects that may get a label, if they are `present`."""
 
     boxes: Boxes
     kind: Int[Array, "*s O"]
@@ -49,7 +49,7 @@ class Objects(NamedTuple):
 
 
 class World(NamedTuple):
-    """A scene before the sensor looks at it."""
+    """A scene before it is scanned."""
 
     ground: Ground
     solids: Solids
@@ -57,10 +57,11 @@ class World(NamedTuple):
 
 
 class Street(NamedTuple):
-    """What kind of street it is; sides are left, right.
+    """The parameters of a street; `sides` are left and right.
 
-    `parked` and `across` say how many of a side's places for parking are taken and whether cars stand there at right
-    angles to the road. `strip` is the width of these places in metres.
+    `lanes` counts those of one direction. `parked` is the fraction of parking spaces that are taken, `across` whether
+    cars park perpendicular to the road, and `strip` the width of the parking spaces in metres. `traffic`, `people` and
+    `yards` are the fractions of these slots that are taken.
     """
 
     lanes: Int[Array, ""]
@@ -74,7 +75,7 @@ class Street(NamedTuple):
 
 @jax.jit
 def sample_world(key: jax.Array) -> World:
-    """Draw a scene."""
+    """Draw a random scene."""
     chances = deal(key, 1, 1, _TRAFFIC, _PARKED, _YARDS, _CROSSING, _PEOPLE, _OBJECTS, NUM_CLUTTER, NUM_CLUTTER_KINDS)
     (
         for_street,
@@ -127,7 +128,7 @@ def _draw_street(chance: Chance) -> Street:
 
 def _draw_ground(chance: Chance, street: Street) -> Ground:
     half = street.lanes * _LANE_WIDTH
-    # The road's middle lies to the left of the sensor, which drives on the right, on any of the lanes.
+    # The sensor drives on the right, in any of the lanes, so the middle of the road is to its left.
     lane = jnp.floor(chance.uniform() * street.lanes)
     middle = half - _LANE_WIDTH * (lane + chance.uniform(0.4, 0.6))
     return Ground(
@@ -141,14 +142,14 @@ def _draw_ground(chance: Chance, street: Street) -> Ground:
         crossing_half=chance.uniform(3.0, 6.0),
         kerb=chance.uniform(0.03, 0.16),
         pavement=chance.uniform(1.2, 4.0),
-        beyond=jnp.where(chance.flip(0.6), material("grass"), material("paving")),
+        beyond=jnp.where(chance.flip(0.6), material("grass"), jnp.int32(material("paving"))),
         shade=chance.uniform(0.75, 1.3),
         roughness=chance.uniform(0.01, 0.045),
     )
 
 
 def _draw_traffic(chance: Chance, street: Street, ground: Ground) -> Slots:
-    """Vehicles on the lanes; on the left half of the road they come towards the sensor."""
+    """Vehicles in the lanes; those on the left half of the road are oncoming."""
     side, lane = np.repeat(_SIDES, _TRAFFIC // 2), np.tile(np.arange(_TRAFFIC // 2) // _LANE, 2)
     step = (_END - _START) / _LANE
     kerb = ground.middle + side * (ground.half_width - _of(side, street.strip))
@@ -162,7 +163,7 @@ def _draw_traffic(chance: Chance, street: Street, ground: Ground) -> Slots:
 
 
 def _draw_parked(chance: Chance, street: Street, ground: Ground) -> Slots:
-    """Cars parked along the kerbs, or at right angles to them."""
+    """Cars parked along the kerbs, or perpendicular to them."""
     side, place = np.repeat(_SIDES, _PARKED // 2), np.tile(np.arange(_PARKED // 2), 2)
     across, strip = _of(side, street.across), _of(side, street.strip)
     first = _of(side, chance.uniform()[:2])
@@ -178,7 +179,7 @@ def _draw_parked(chance: Chance, street: Street, ground: Ground) -> Slots:
 
 
 def _draw_yards(chance: Chance, street: Street, ground: Ground) -> Slots:
-    """Cars in drives and on parking places beyond the pavements, at right angles or at any."""
+    """Cars in drives and car parks beyond the pavements, most of them nearly parallel or perpendicular to the road."""
     side = np.repeat(_SIDES, _YARDS // 2)
     away = ground.half_width + ground.pavement + chance.uniform(2.5, 18.0)
     quarter = jnp.floor(chance.uniform(0.0, 4.0)) * (jnp.pi / 2)
@@ -205,11 +206,11 @@ def _draw_crossing(chance: Chance, ground: Ground) -> Slots:
 
 def _vehicle_kind(chance: Chance, *, vans: float, trucks: float) -> Int[Array, " n"]:
     draw = chance.uniform()
-    return jnp.where(draw < trucks, TRUCK, jnp.where(draw < trucks + vans, VAN, CAR))
+    return jnp.where(draw < trucks, TRUCK, jnp.where(draw < trucks + vans, VAN, jnp.int32(CAR)))
 
 
 def _draw_people(chance: Chance, street: Street, ground: Ground) -> Slots:
-    """Pedestrians on the pavements, cyclists at the edges of the road."""
+    """Pedestrians on the pavements and cyclists at the edges of the road."""
     side, rides = np.repeat(_SIDES, _PEOPLE // 2), chance.flip(0.3)
     walk = ground.half_width + ground.pavement * chance.uniform(0.1, 0.95)
     ride = ground.half_width - _of(side, street.strip) - 0.4
@@ -228,7 +229,7 @@ def _of(side: np.ndarray, values: Array) -> Array:
 
 
 def _settle(slots: Slots, size: Float[Array, "O 3"], clutter: Slots, ground: Ground) -> tuple[Objects, Slots]:
-    """Objects on the ground where none stands in another, and the clutter that stands in none of them."""
+    """Place objects and clutter on the ground, and remove those that collide with an earlier one."""
     u = jnp.concatenate([slots.u, clutter.u])
     v = jnp.concatenate([slots.v, clutter.v])
     x, y = road_to_lidar(ground, u, v)
@@ -237,7 +238,7 @@ def _settle(slots: Slots, size: Float[Array, "O 3"], clutter: Slots, ground: Gro
     size = jnp.concatenate([jnp.asarray(size), clutter.size])
     height = ground_height(ground, x, y) + size[:, 2] / 2
     boxes = Boxes(jnp.stack([x, y, height], -1), size, yaw)
-    # Only what parks or stands must leave the crossing street free, and only traffic keeps its distance.
+    # Parked cars and clutter keep the crossing street free; traffic keeps a larger distance.
     index, parked = np.arange(len(u)), _TRAFFIC + _PARKED + _YARDS
     standing = ((index >= _TRAFFIC) & (index < parked)) | (index >= len(slots.u))
     reach = (jnp.abs(jnp.cos(yaw)) * size[:, 0] + jnp.abs(jnp.sin(yaw)) * size[:, 1]) / 2
@@ -250,7 +251,7 @@ def _settle(slots: Slots, size: Float[Array, "O 3"], clutter: Slots, ground: Gro
 
 
 def _build(shape, objects: Objects, style: Float[Array, "O n"], which: slice) -> Solids:  # type: ignore[no-untyped-def]
-    """The solids of some objects, one after the other."""
+    """The solids of the objects `which`, along one axis."""
     boxes, kind, style = jax.tree.map(lambda leaf: leaf[which], (objects.boxes, objects.kind, style))
     parts = jax.vmap(shape)(boxes.size, kind, style)
     bottom = boxes.center - boxes.size * jnp.array([[0.0, 0.0, 0.5]])
@@ -264,6 +265,6 @@ def _build(shape, objects: Objects, style: Float[Array, "O n"], which: slice) ->
 
 
 def _ego() -> Solids:
-    """The roof of the car that carries the sensor: it throws no ray back, but none goes through."""
+    """The roof of the car that carries the sensor, which stops rays and reflects none."""
     roof = (1.05, 1.3, 0.55, 0.0, 1.0)
     return stack([solid((0.0, 0.0, -0.39), roof, material("ego"), radii=(1.9, 0.75, jnp.inf))])

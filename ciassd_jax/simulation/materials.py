@@ -1,4 +1,4 @@
-"""What surfaces give back: KITTI's reflectance of each material, and how rays get lost in it."""
+"""How materials reflect the rays: intensity as in KITTI, lost returns, and penetration."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 class Material(NamedTuple):
     """A surface as the sensor sees it.
 
-    `reflectance` is the typical intensity at right angles, `spread` its standard deviation from point to point, `loss`
-    the part of rays that never return, `depth` the mean way in metres that a ray goes into it: leaves, or a cabin.
+    `reflectance` is the typical intensity at normal incidence and `spread` its standard deviation from point to point.
+    `loss` is the fraction of rays that never return, and `depth` the mean penetration in metres (leaves, a cabin).
     """
 
     reflectance: float
@@ -20,7 +20,7 @@ class Material(NamedTuple):
     depth: float
 
 
-# By eye from the reflectance of points of six full KITTI frames and of the labelled objects of 155.
+# Fitted by eye to the reflectance of points in six full KITTI frames and of the labelled objects in 155 frames.
 _TABLE = {
     "asphalt": Material(0.28, 0.06, 0.0, 0.0),
     "paving": Material(0.34, 0.07, 0.0, 0.0),
@@ -39,10 +39,10 @@ _TABLE = {
     "ego": Material(0.0, 0.0, 1.0, 0.0),
 }
 NAMES = tuple(_TABLE)
-# One row of the four numbers for each name.
+# One row of the four values per material.
 MATERIALS = np.array(list(_TABLE.values()), np.float32)
 
 
 def material(name: str) -> int:
-    """The index of a material in `MATERIALS`."""
+    """Return the index of a material in `MATERIALS`."""
     return NAMES.index(name)

@@ -1,7 +1,7 @@
-"""What vehicles and people are built of: solids about the bottom centre of the object's box, front along +u.
+"""Vehicles and people built of solids, relative to the bottom centre of the object's box, with the front along +u.
 
-Every function takes the box's size (length, width, height) in metres and `style`, uniform numbers in [0, 1] that vary
-the shape, and fills the box to its faces, as KITTI's labels do.
+Every function takes the size of the box (length, width, height) in metres and `style`, uniform numbers in [0, 1] that
+vary the shape. The solids reach the faces of the box, as labelled objects do in KITTI.
 """
 
 from __future__ import annotations
@@ -26,42 +26,42 @@ SIZES = (
     ((0.84, 0.65, 1.75), (0.20, 0.12, 0.12)),
     ((1.78, 0.60, 1.74), (0.14, 0.10, 0.09)),
 )
-# Length, width and height of a kind go together as those of cars' labels do.
+# Correlation of length, width and height in the labels of cars, used for every kind.
 _CORRELATION = np.array([[1, 0.33, 0.19], [0.33, 1, 0.31], [0.19, 0.31, 1]])
 _FACTOR = np.linalg.cholesky(_CORRELATION).astype(np.float32)
-_MOST = 2.2
+_MAX_DEVIATION = 2.2
 
 
 def draw_size(draws: Float[Array, " 3"], kind: Int[Array, ""]) -> Float[Array, " 3"]:
-    """The size of an object of a kind from three standard normal draws, cut at 2.2 standard deviations."""
+    """Return the size of an object from three standard normal draws, clipped at 2.2 standard deviations."""
     table = jnp.array(SIZES, jnp.float32)[kind]
-    return table[0] + table[1] * jnp.clip(jnp.array(_FACTOR) @ draws, -_MOST, _MOST)
+    return table[0] + table[1] * jnp.clip(jnp.array(_FACTOR) @ draws, -_MAX_DEVIATION, _MAX_DEVIATION)
 
 
 def vehicle(size: Float[Array, " 3"], kind: Int[Array, ""], style: Float[Array, " n"]) -> Solids:
-    """The solids of a car, a van or a truck."""
+    """Return the solids of a car, a van or a truck."""
     built = [build(size, style) for build in (_car, _van, _truck)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[kind], *built)
 
 
 def person(size: Float[Array, " 3"], kind: Int[Array, ""], style: Float[Array, " n"]) -> Solids:
-    """The solids of a pedestrian or a cyclist."""
+    """Return the solids of a pedestrian or a cyclist."""
     built = [build(size, style) for build in (_pedestrian, _cyclist)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[kind - PEDESTRIAN], *built)
 
 
 def _paint(style: Float[Array, " n"]) -> Array:
-    """Reflectance of a vehicle's paint: near half of all hardly reflect, the others anything up to white."""
+    """Reflectance of a vehicle's paint: dark for half of the vehicles, anything up to white for the others."""
     return jnp.where(style[6] < 0.5, 0.04 * style[7], 0.3 + 0.5 * style[7])
 
 
 def _car(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
-    """Hatchback, saloon, estate or off-roader: body with rounded corners, bonnet, cabin of glass under a roof."""
+    """A hatchback, saloon, estate or off-roader: body with rounded corners, bonnet, glass cabin with a roof."""
     length, width, height = size
     front, side, paint = length / 2, width / 2, _paint(style)
     types = jnp.array([0.45, 0.65, 0.85])
     chosen = jnp.sum(style[2] > types)
-    # Metres that the rear window recedes per metre up, and the lid behind it, by type.
+    # By type: the slope of the rear window in metres per metre of height, and the length of the boot lid.
     recede = jnp.array([-0.45, -1.5, -0.25, -0.35])[chosen]
     lid = jnp.array([0.02, 0.14, 0.01, 0.02])[chosen] * length
     clearance, belt = 0.15 + 0.07 * style[0], height * (0.60 + 0.05 * style[1])
@@ -108,7 +108,7 @@ def _car(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
 
 
 def _van(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
-    """A box on a body with a short bonnet; glass around the driver."""
+    """A body with a short bonnet, a box on top of it, and glass around the driver."""
     length, width, height = size
     front, side, paint = length / 2, width / 2, _paint(style)
     clearance, belt = 0.2, height * (0.48 + 0.06 * style[1])
@@ -119,7 +119,7 @@ def _van(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
     up = height - belt
     rounding = (1.4 * front, 1.1 * side, jnp.inf)
     full = (front + 0.1 * clearance, front + 0.05 * clearance, side, nose - tilt * front, -clearance)
-    # Behind the bonnet the tilted top lies above the belt, where the box is anyway.
+    # Behind the bonnet the tilted top rises above the belt, inside the box.
     window = (front - bonnet + 0.02, 0.9 - front + bonnet, side + 0.01, up - 0.2, -0.05)
     hidden = _absent()
     return stack(
@@ -166,7 +166,7 @@ def _truck(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
 
 
 def _wheels(ahead: Array, behind: Array, side: Array, radius: Array | float, half_width: float) -> list[Solids]:
-    """Four wheels, flush with the sides."""
+    """Four wheels, flush with the sides of the vehicle."""
     limits = (radius, radius, half_width, radius, radius)
     radii = (radius, jnp.inf, radius)
     return [
@@ -177,7 +177,7 @@ def _wheels(ahead: Array, behind: Array, side: Array, radius: Array | float, hal
 
 
 def _plates(front: Array, rear_height: Array | float) -> list[Solids]:
-    """Licence plates, whose foil throws the beam straight back."""
+    """Two licence plates, which are retroreflective."""
     size = (0.04, 0.5, 0.11)
     return [
         block((front - 0.025, 0, 0.42), size, material("plate")),
@@ -190,7 +190,7 @@ def _absent() -> Solids:
 
 
 def _pedestrian(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
-    """Legs in stride, trunk, arms and head."""
+    """Legs in mid-stride, trunk, arms and head."""
     length, width, height = size
     step, shade = length / 2 - 0.09, 0.3 + 1.4 * style[0]
     cloth = material("cloth")
@@ -207,7 +207,7 @@ def _pedestrian(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
 
 
 def _cyclist(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
-    """Two wheels, a frame, and the rider bent forward."""
+    """Two wheels, a frame, and a rider bent forward."""
     length, width, height = size
     radius, cloth, shade = 0.33, material("cloth"), 0.3 + 1.4 * style[0]
     wheel = (radius, radius, 0.025, radius, radius)

@@ -1,4 +1,4 @@
-"""The sensor: what a Velodyne HDL-64E records of a world."""
+"""The sensor: what a Velodyne HDL-64E records of a scene."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from ciassd_jax.types import Array, PointCloud
 
 @dataclass(frozen=True)
 class Lidar:
-    """The sensor's numbers: those of the HDL-64E as its full KITTI frames show them.
+    """The parameters of the sensor; the defaults are those of the HDL-64E, estimated from full KITTI frames.
 
-    Two blocks of beams between two elevations in degrees each; columns are azimuths, evenly spaced round the circle.
-    `noise` is the standard deviation of a range and `max_range` the farthest return in metres, `lost` the part of the
-    rays that never returns from anywhere.
+    `upper` and `lower` are blocks of beams: first and last elevation in degrees, and number. `columns` is the number of
+    azimuths, evenly spaced over the full circle. `noise` is the standard deviation of the range and `max_range` the
+    largest range, in metres; `lost` is the fraction of rays that never return.
     """
 
     upper: tuple[float, float, int] = (2.4, -7.85, 32)
@@ -33,23 +33,26 @@ class Lidar:
     noise: float = 0.02
     lost: float = 0.01
     max_range: float = 80.0
-    # Pairs of a solid and a tile of 16 x 16 rays (`casting`).
+    # The capacity for pairs of a solid and a tile of rays (`casting.cast`).
     max_pairs: int = 4096
 
     def __post_init__(self) -> None:
         if (self.upper[2] + self.lower[2]) % TILE or self.columns % TILE or self.columns < TILE:
-            raise ValueError(f"lidar: the numbers of beams and of columns must be multiples of {TILE}.")
+            raise ValueError(f"Lidar: the numbers of beams and of columns must be multiples of {TILE}.")
 
     def rays(self) -> Rays:
-        """Its directions; the first column looks back."""
+        """Return the directions of the rays; the first column points backwards."""
         elevation = np.deg2rad(np.concatenate([np.linspace(*self.upper), np.linspace(*self.lower)]))
         azimuth = (np.arange(self.columns) / self.columns * 2 - 1) * np.pi
         return Rays(jnp.asarray(azimuth, jnp.float32), jnp.asarray(np.tan(elevation), jnp.float32))
 
 
 class Draws(NamedTuple):
-    """What chance gives every ray: a range error and a spread of intensity (standard normal), whether it returns
-    (uniform), and how far it strays into leaves and cabins (exponential)."""
+    """The random numbers of every ray.
+
+    `error` of the range and `spread` of the intensity are standard normal. `fate` is uniform and decides whether the
+    ray returns; `stray` is exponential and scales how far it enters leaves and cabins.
+    """
 
     error: Float[Array, "*s rows columns"]
     spread: Float[Array, "*s rows columns"]
@@ -58,10 +61,10 @@ class Draws(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What every ray meets first, whether it returns or not.
+    """The first hit of every ray, whether it returns or not.
 
-    `range` is the distance in metres, inf for nothing; `cosine` that of incidence; `owner` the object, -1 for none.
-    `dropped` counts pairs over capacity (`casting.Hits`).
+    `range` is in metres, inf without a hit; `cosine` is that of incidence; `owner` is the index of the object, -1 for
+    none. `dropped` counts pairs over capacity (`casting.Hits`).
     """
 
     range: Float[Array, "*s rows columns"]
@@ -73,31 +76,31 @@ class Sight(NamedTuple):
 
 
 def scan(key: jax.Array, world: World, lidar: Lidar) -> tuple[PointCloud, Sight]:
-    """One turn of the sensor: the points that it records beam by beam, and what its rays met."""
+    """Return the points of one revolution, beam by beam, and the first hit of every ray."""
     draws = _draw(key, lidar)
     sight = _look(world, draws, lidar)
     return _record(sight, draws, lidar), sight
 
 
-# Each step is a program of its own: in one program XLA fuses across the steps and computes much of them several times.
+# Each step is a separate program: in one program XLA fuses across the steps and repeats much of the computation.
 @partial(jax.jit, static_argnames="lidar")
 def _draw(key: jax.Array, lidar: Lidar) -> Draws:
     shape = (lidar.upper[2] + lidar.lower[2], lidar.columns)
     bits = jax.random.bits(key, (4, *shape))
-    # From below 1, so that the logarithm is finite.
+    # Less than 1, so that the logarithm is finite.
     uniform = (bits[2:] >> 8).astype(jnp.float32) * 2.0**-24
     return Draws(_bell(bits[0]), _bell(bits[1]), uniform[0], -jnp.log1p(-uniform[1]))
 
 
 def _bell(bits: Array) -> Array:
-    """Mean 0 and deviation 1 from random bits: the sum of four bytes, which lies within 3.5 deviations."""
+    """Approximately standard normal numbers from random bits: the scaled sum of four bytes, within 3.5 deviations."""
     total = sum((bits >> shift & 255).astype(jnp.float32) for shift in (0, 8, 16, 24))
     return (total - 510.0) / np.sqrt(4 * (256**2 - 1) / 12).astype(np.float32)
 
 
 @partial(jax.jit, static_argnames="lidar")
 def _look(world: World, draws: Draws, lidar: Lidar) -> Sight:
-    """Cast the rays at the solids and the ground."""
+    """Cast the rays on the solids and the ground."""
     rays, depth = lidar.rays(), jnp.array(MATERIALS)[world.solids.material, 3]
     hits = cast(world.solids, depth, rays, draws.stray, lidar.max_pairs)
     ground = cast_ground(world.ground, rays.azimuth, rays.tangent, _waves(draws.error))
@@ -115,7 +118,7 @@ def _look(world: World, draws: Draws, lidar: Lidar) -> Sight:
 
 @partial(jax.jit, static_argnames="lidar")
 def _record(sight: Sight, draws: Draws, lidar: Lidar) -> PointCloud:
-    """The rays that return, as points."""
+    """Turn the rays that return into points."""
     rays, surface = lidar.rays(), jnp.array(MATERIALS)[sight.material]
     signal = _signal(surface, sight, draws.spread)
     returned = (draws.fate < _likelihood(surface, signal, sight, lidar)) & (sight.range < lidar.max_range)
@@ -126,14 +129,14 @@ def _record(sight: Sight, draws: Draws, lidar: Lidar) -> PointCloud:
 
 
 def _waves(noise: Float[Array, "rows columns"]) -> Array:
-    """Standard normal numbers that go together over 16 columns, as bumps of the ground do, from independent ones."""
+    """Standard normal numbers correlated over 16 columns, for bumps of the ground, from independent ones."""
     for shift in (1, 2, 4, 8):
         noise = (noise + jnp.roll(noise, shift, 1)) * 0.5**0.5
     return noise
 
 
 def _signal(surface: Float[Array, "rows columns 4"], sight: Sight, spread: Float[Array, "rows columns"]) -> Array:
-    """Intensity in hundredths, as KITTI's: reflectance by material and shade, less at flat angles."""
+    """Intensity, rounded to hundredths as in KITTI: reflectance by material and shade, lower at grazing incidence."""
     glossy = surface[..., 0] >= 1
     angle = jnp.where(glossy, 0.15 + 0.55 * sight.cosine**2, 0.75 + 0.25 * sight.cosine)
     level = surface[..., 0] * sight.shade * angle + surface[..., 1] * spread * jnp.sqrt(sight.shade)
@@ -143,15 +146,15 @@ def _signal(surface: Float[Array, "rows columns 4"], sight: Sight, spread: Float
 def _likelihood(
     surface: Float[Array, "rows columns 4"], signal: Float[Array, "rows columns"], sight: Sight, lidar: Lidar
 ) -> Array:
-    """How likely rays return: seldom from far away, from flat angles, dark surfaces and windows."""
+    """Probability of a return: low for long ranges, grazing incidence, dark surfaces and windows."""
     energy = (0.035 + signal) * (0.05 + jnp.maximum(sight.cosine, 0)) * (30.0 / sight.range) ** 2
     return (1 - surface[..., 2]) * (1 - lidar.lost) * (1 - jnp.exp(-60 * energy))
 
 
 def _compact(columns: tuple[Array, ...], kept: Array) -> PointCloud:
-    """The points that are kept, beam by beam, then zeros."""
+    """Move the points that are kept to the front, in order, and fill up with zeros."""
     kept = kept.reshape(-1)
     place = jnp.where(kept, jnp.cumsum(kept) - 1, kept.size)
-    # Column by column: in one scatter XLA would compute every point once for each of its four columns.
+    # One scatter per column: in a single scatter XLA would compute every point four times.
     packed = [jnp.zeros(kept.size).at[place].set(values.reshape(-1), mode="drop") for values in columns]
     return PointCloud(jnp.stack(packed, -1), kept.sum(dtype=jnp.int32))

@@ -1,4 +1,4 @@
-"""Places where something may stand, and which of them stay free."""
+"""Slots where an object may stand, random draws for them, and the removal of objects that collide."""
 
 from __future__ import annotations
 
@@ -12,44 +12,44 @@ from jaxtyping import Bool, Float, Int
 from ciassd_jax.ops.footprints import footprints_collide
 from ciassd_jax.types import Array, Boxes
 
-# Draws that a group may use.
+# Draws per slot of a group.
 _DRAWS = 40
-# The car that carries the sensor, with some room.
+# Length, width and height of the car that carries the sensor, with a margin.
 _EGO = (6.0, 2.6, 1.5)
 
 
 class Chance:
-    """Independent uniform draws [D, n] for n slots, or [D] for one; every use takes the next ones."""
+    """Independent uniform draws [D, n] for n slots, or [D] for one; every method consumes the next ones."""
 
     def __init__(self, draws: Float[Array, " D *n"]) -> None:
         self._draws = iter(draws)
 
     def uniform(self, low: Array | float = 0.0, high: Array | float = 1.0) -> Array:
-        """Uniform in [low, high)."""
+        """Return numbers that are uniform in [low, high)."""
         return low + (high - low) * next(self._draws)
 
     def normal(self) -> Array:
-        """Mean 0 and deviation 1, bell-shaped and within [-3, 3]: the sum of three uniform draws."""
-        # The inverse of the normal distribution takes the compiler ten times as long.
+        """Return approximately standard normal numbers in [-3, 3], scaled sums of three uniform draws."""
+        # The inverse of the normal distribution takes ten times as long to compile.
         return 2 * (next(self._draws) + next(self._draws) + next(self._draws) - 1.5)
 
     def flip(self, probability: Array | float) -> Array:
-        """True with a probability."""
+        """Return True with the given probability."""
         return next(self._draws) < probability
 
 
 def deal(key: jax.Array, *slots: int) -> list[Chance]:
-    """Draws for groups of so many slots; scalars for a single one."""
-    # One call: each call of the generator takes the compiler a third of a second.
+    """Return the draws of each group, given its number of slots; a group of one slot draws scalars."""
+    # One call for all: each call of the generator adds a third of a second to compilation.
     draws = jax.random.uniform(key, (_DRAWS, sum(slots)))
     parts = jnp.split(draws, list(itertools.accumulate(slots))[:-1], axis=1)
     return [Chance(part[:, 0] if part.shape[1] == 1 else part) for part in parts]
 
 
 class Slots(NamedTuple):
-    """Places along (u) and across (v) the road in metres, headings to the road, what stands there, and whether it does.
+    """Objects that may be present: position along (u) and across (v) the road in metres, yaw relative to it, and kind.
 
-    `size` (length, width, height) is given where it does not follow from the kind.
+    `size` (length, width, height) is None if the kind determines it.
     """
 
     u: Float[Array, " n"]
@@ -61,14 +61,15 @@ class Slots(NamedTuple):
 
 
 def join(*groups: Slots) -> Slots:
-    """All slots of several groups, in order."""
+    """Concatenate groups of slots."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *groups)
 
 
 def keep_apart(boxes: Boxes, present: Bool[Array, " n"], *, margin: float, moving: Bool[Array, " n"]) -> Array:
-    """Which boxes stay: those that stand in no earlier present one and not in the car that carries the sensor.
+    """Return which boxes stay: those that collide with no earlier present box and not with the sensor's car.
 
-    `margin` is the least distance in metres between two. One that gave way still keeps later ones away.
+    `margin` is the smallest distance in metres between two boxes; `moving` ones need two more metres along their
+    length. A box that is removed still blocks later ones.
     """
     size = jnp.maximum(boxes.size + margin, 0.0)
     wide = boxes._replace(size=jnp.where(moving[:, None], size + jnp.array([[2.0, 0.0, 0.0]]), size))

@@ -1,7 +1,7 @@
-"""Convex solids that everything in a synthetic scene is built of, and where a ray meets them.
+"""Convex solids, of which everything in a synthetic scene is built, and their intersections with rays.
 
-A solid has a frame of its own: u forward, v left, w up from its origin, turned by yaw about z. It is the intersection
-of six half-spaces whose faces may slope and of an ellipsoid or elliptic cylinder about its origin.
+In its own frame, a solid has u forward, v left and w up from its origin, rotated by yaw about z. It is the intersection
+of six half-spaces, whose faces may slope, with an ellipsoid or elliptic cylinder around the origin.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from jaxtyping import Bool, Float, Int
 
 from ciassd_jax.types import Array
 
-# A face that a ray runs along is met this flatly, far behind or far ahead.
+# Smallest rate and curvature: a ray parallel to a face meets it far away instead of dividing by zero.
 _FLAT = 1e-9
 
 
 class Solids(NamedTuple):
     """Solids in the LiDAR frame; lengths in metres.
 
-    With (u, v, w) in a solid's frame it holds the points with u <= front + lean[0] w, -u <= rear + lean[1] w,
-    |v| <= side + lean[2] w, w <= top + lean[3] u, -w <= bottom, and curve . (u^2, v^2, w^2) <= 1, where `curve` are
-    inverse squared radii, 0 for none. `limits` are (front, rear, side, top, bottom). `material` is an index into
-    `materials.MATERIALS`, `shade` a factor on its reflectance, `owner` the object it is part of, -1 for none.
+    A solid contains the points (u, v, w) of its frame with u <= front + lean[0] w, -u <= rear + lean[1] w,
+    |v| <= side + lean[2] w, w <= top + lean[3] u, -w <= bottom, and curve . (u^2, v^2, w^2) <= 1. `limits` are (front,
+    rear, side, top, bottom), and `curve` are inverse squared radii, 0 for none. `material` is an index into
+    `materials.MATERIALS`, `shade` a factor on its reflectance, and `owner` the object it belongs to, -1 for none.
     """
 
     origin: Float[Array, "*s 3"]
@@ -47,7 +47,7 @@ def solid(
     radii: tuple[Array | float, ...] = (jnp.inf, jnp.inf, jnp.inf),
     shade: Array | float = 1.0,
 ) -> Solids:
-    """One solid with the axes of its object; `radii` are those of the ellipsoid, infinite for none."""
+    """Return one solid, aligned with its object; `radii` are those of the ellipsoid, infinite for none."""
     return Solids(
         origin=_row(origin),
         yaw=jnp.zeros(()),
@@ -62,30 +62,30 @@ def solid(
 
 
 def block(center: tuple, size: tuple, material: int, **more: Array | float | tuple) -> Solids:
-    """A box of (length, width, height) about `center`."""
+    """Return a box of (length, width, height) around `center`."""
     length, width, height = (edge / 2 for edge in size)
     return solid(center, (length, length, width, height, height), material, **more)  # type: ignore[arg-type]
 
 
 def column(base: tuple, radius: Array | float, height: Array | float, material: int) -> Solids:
-    """An upright cylinder on `base`."""
+    """Return an upright cylinder on `base`."""
     limits = (radius, radius, radius, height, 0.0)
     return solid(base, limits, material, radii=(radius, radius, jnp.inf))
 
 
 def ellipsoid(center: tuple, radii: tuple, material: int, **more: Array | float) -> Solids:
-    """An ellipsoid about `center`."""
+    """Return an ellipsoid around `center`."""
     limits = (radii[0], radii[0], radii[1], radii[2], radii[2])
     return solid(center, limits, material, radii=radii, **more)  # type: ignore[arg-type]
 
 
 def stack(solids: list[Solids]) -> Solids:
-    """Solids with a leading axis, from single ones."""
+    """Stack single solids along a leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *solids)
 
 
 def place(solids: Solids, position: Float[Array, " 3"], yaw: Float[Array, ""]) -> Solids:
-    """Solids [S] of an object at the origin, moved to `position` after a turn by `yaw`."""
+    """Rotate the solids [S] of an object at the origin by `yaw`, then move them to `position`."""
     cosine, sine = jnp.cos(yaw), jnp.sin(yaw)
     x, y, z = solids.origin[:, 0], solids.origin[:, 1], solids.origin[:, 2]
     turned = jnp.stack([x * cosine - y * sine, x * sine + y * cosine, z], -1)
@@ -97,9 +97,9 @@ def _row(values: tuple[Array | float, ...]) -> Array:
 
 
 def cross(solids: Solids, direction: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    """Horizontal distances in metres at which rays from the sensor enter and leave solids; they miss if enter >= leave.
+    """Return the horizontal distances in metres at which rays enter and leave solids; a miss has enter >= leave.
 
-    `direction` are (du, dv, dw) in the solids' frames per metre of horizontal distance; everything broadcasts.
+    `direction` is (du, dv, dw) in the solids' frames per metre of horizontal distance; all arguments broadcast.
     """
     enter: Array = jnp.float32(-jnp.inf)
     leave: Array = jnp.float32(jnp.inf)
@@ -113,7 +113,7 @@ def cross(solids: Solids, direction: tuple[Array, Array, Array]) -> tuple[Array,
 
 
 def incidence(solids: Solids, direction: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    """Where rays enter solids that they meet, as in `cross`, and the cosine of the angle to the normal there."""
+    """Return where rays enter the solids that they hit, as `cross`, and the cosine of incidence there."""
     du, dv, dw = direction
     length = jnp.sqrt(du**2 + dv**2 + dw**2)
     enter, cosine = _cross_ellipsoid(solids, direction)[0], _ellipsoid_cosine(solids, direction, length)
@@ -126,14 +126,14 @@ def incidence(solids: Solids, direction: tuple[Array, Array, Array]) -> tuple[Ar
 
 
 def sensor_in(solids: Solids) -> tuple[Array, Array, Array]:
-    """The sensor's place (u, v, w) in the solids' frames."""
+    """Return the position (u, v, w) of the sensor in the solids' frames."""
     cosine, sine = jnp.cos(solids.yaw), jnp.sin(solids.yaw)
     x, y, z = solids.origin[..., 0], solids.origin[..., 1], solids.origin[..., 2]
     return -(x * cosine + y * sine), x * sine - y * cosine, -z
 
 
 def extent(solids: Solids) -> tuple[Array, Array, Array, Array, Array]:
-    """How far solids reach at most to the front, the rear, the sides, up and down from their origins."""
+    """Return bounds on how far solids extend forward, backward, sideways, up and down from their origins."""
     front, rear, side, top, bottom = (solids.limits[..., i] for i in range(5))
     radii = 1 / jnp.sqrt(jnp.maximum(solids.curve, _FLAT**2))
     high = jnp.minimum(top + jnp.maximum(solids.lean[..., 3] * front, -solids.lean[..., 3] * rear), radii[..., 2])
@@ -148,7 +148,7 @@ def extent(solids: Solids) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def _faces(solids: Solids, direction: tuple[Array, Array, Array]) -> list[tuple[Array, Array, Array]]:
-    """Of every half-space: left minus right side at the sensor, the rate of that along rays, its normal's length."""
+    """For every half-space: left minus right side at the sensor, its rate along rays, and the length of the normal."""
     du, dv, dw = direction
     u, v, w = sensor_in(solids)
     front, rear, side, top, bottom = (solids.limits[..., i] for i in range(5))
@@ -164,7 +164,7 @@ def _faces(solids: Solids, direction: tuple[Array, Array, Array]) -> list[tuple[
 
 
 def _cross_ellipsoid(solids: Solids, direction: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    """Where rays enter and leave the ellipsoid: roots of a quadratic; (inf, -inf) where there are none."""
+    """Where rays enter and leave the ellipsoid: the roots of a quadratic, or (inf, -inf) without roots."""
     square, half, rest = jnp.zeros(()), jnp.zeros(()), -jnp.ones(())
     for axis, (place, rate) in enumerate(zip(sensor_in(solids), direction, strict=True)):
         curve = solids.curve[..., axis]
@@ -178,7 +178,7 @@ def _cross_ellipsoid(solids: Solids, direction: tuple[Array, Array, Array]) -> t
 
 
 def _ellipsoid_cosine(solids: Solids, direction: tuple[Array, Array, Array], length: Array) -> Array:
-    """Cosine of incidence where rays enter the ellipsoid: its gradient there along the ray."""
+    """Cosine of incidence where rays enter the ellipsoid, from the gradient there."""
     enter, _ = _cross_ellipsoid(solids, direction)
     along, square = jnp.zeros(()), jnp.zeros(())
     for axis, (place, rate) in enumerate(zip(sensor_in(solids), direction, strict=True)):

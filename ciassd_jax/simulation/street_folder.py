@@ -1,4 +1,4 @@
-"""Synthetic frames as a folder in KITTI's layout."""
+"""A folder of synthetic frames in KITTI's layout."""
 
 from __future__ import annotations
 
@@ -8,27 +8,29 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from ciassd_jax.data.frames import Frame
 from ciassd_jax.data.kitti import FULL, IMAGE
 from ciassd_jax.formats.errors import InputError, Pathlike
 from ciassd_jax.formats.kitti_camera import Camera, lidar_to_image
-from ciassd_jax.formats.kitti_rows import write_rows
+from ciassd_jax.formats.kitti_rows import ObjectRow, write_rows
 from ciassd_jax.formats.points import write_bin
 from ciassd_jax.formats.writing import check_folder, replacing, write_text
 from ciassd_jax.ops.camera import project
 from ciassd_jax.simulation.sensor import Lidar
-from ciassd_jax.simulation.streets import SyntheticFrame, make_frame
-from ciassd_jax.simulation.virtual_camera import calibration_text
+from ciassd_jax.simulation.streets import frame_name, make_frame
+from ciassd_jax.simulation.virtual_camera import calibration_text, virtual_camera
 
-# Says whose folder it is, so that nothing else is ever overwritten.
+# Marks folders that `write_synthetic` wrote, so that nothing else is ever overwritten.
 MARK = "synthetic.txt"
 _PARTS = ("training", "ImageSets", MARK)
-# Every fourth frame is of the split val.
+# Every fourth frame belongs to the split val.
 _VALIDATION = 4
-# A depth image spans these metres, near ones bright; a point is this many pixels wide and high.
+# A depth image shows this range of depths in metres; a point is a square of this many pixels.
 _DEPTHS, _DOT = (3.0, 80.0), 3
 
 
@@ -41,28 +43,33 @@ def write_synthetic(
     lidar: Lidar | None = None,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> int:
-    """Write frames 0 to `frames` - 1 of a seed as OUT/training and OUT/ImageSets; returns the pairs over capacity.
+    """Write frames 0 to `frames` - 1 of a seed as OUT/training and OUT/ImageSets; returns the sum of `dropped` pairs.
 
-    Frames 3, 7, 11, ... are the split val, the others train. Frame i depends on the seed and i alone. `overwrite`
-    replaces what this function wrote there before. `track` sees the frames go by, for a progress bar. Raises
-    InputError for a folder that cannot be used, and without pillow.
+    Frames 3, 7, 11, ... form the split val, the others the split train. `overwrite` replaces what this function wrote
+    there before. `track` wraps the iteration over the frames, for a progress bar. Raises InputError for a folder that
+    cannot be used, and without pillow.
     """
     folder = Path(out)
     _require_pillow()
     _clear(folder, overwrite)
     write_text(folder / MARK, f"{frames} synthetic frames of seed {seed}, written by `ciassd data synth`")
-    names = [f"{index:06d}" for index in range(frames)]
-    validation = [name for index, name in enumerate(names) if index % _VALIDATION == _VALIDATION - 1]
-    training = [name for index, name in enumerate(names) if index % _VALIDATION != _VALIDATION - 1]
+    names = [frame_name(index) for index in range(frames)]
+    validation = names[_VALIDATION - 1 :: _VALIDATION]
+    training = [name for name in names if name not in validation]
     for split, some in (("train", training), ("val", validation), ("trainval", names)):
         with replacing(folder / "ImageSets" / f"{split}.txt") as temporary:
             temporary.write_text("".join(f"{name}\n" for name in some))
     made = make_frames(seed, range(frames), lidar)
-    return sum(_write_frame(folder / "training", names[index], next(made)) for index in track(range(frames)))
+    total = 0
+    for _ in track(range(frames)):
+        frame, dropped = next(made)
+        _write_frame(folder / "training", frame)
+        total += dropped
+    return total
 
 
-def make_frames(seed: int, indices: Iterable[int], lidar: Lidar | None = None) -> Iterator[SyntheticFrame]:
-    """Frames in order, made by a thread for every core."""
+def make_frames(seed: int, indices: Iterable[int], lidar: Lidar | None = None) -> Iterator[tuple[Frame, int]]:
+    """Yield `make_frame` of each index in order, with one thread per core."""
     threads = os.cpu_count() or 1
     pending: deque = deque()
     with ThreadPoolExecutor(threads) as pool:
@@ -75,14 +82,14 @@ def make_frames(seed: int, indices: Iterable[int], lidar: Lidar | None = None) -
 
 
 def _clear(folder: Path, overwrite: bool) -> None:
-    """Make room in the folder, or say why not."""
+    """Empty the folder if that is allowed; raises InputError otherwise."""
     check_folder(folder)
     if not folder.is_dir() or not any(folder.iterdir()):
         return
     if not overwrite:
-        raise InputError(f"{folder} is not empty; name another folder, or replace what is there with --overwrite.")
+        raise InputError(f"{folder} is not empty; choose another folder, or replace its content with `overwrite`.")
     if not (folder / MARK).is_file():
-        raise InputError(f"{folder} was not written by `ciassd data synth`, so it stays; name another folder.")
+        raise InputError(f"{folder} was not written by `write_synthetic` and stays; choose another folder.")
     for part in _PARTS:
         path = folder / part
         if path.is_dir():
@@ -91,21 +98,21 @@ def _clear(folder: Path, overwrite: bool) -> None:
             path.unlink(missing_ok=True)
 
 
-def _write_frame(folder: Path, name: str, frame: SyntheticFrame) -> int:
-    """Write the four files of a frame; returns the pairs over capacity."""
-    with replacing(folder / FULL.format(name)) as temporary:
+def _write_frame(folder: Path, frame: Frame) -> None:
+    """Write the four files of a frame."""
+    rows = cast(tuple[ObjectRow, ...], frame.rows)
+    with replacing(folder / FULL.format(frame.name)) as temporary:
         write_bin(temporary, frame.points)
-    with replacing(folder / f"calib/{name}.txt") as temporary:
+    with replacing(folder / f"calib/{frame.name}.txt") as temporary:
         temporary.write_text(calibration_text())
-    with replacing(folder / f"label_2/{name}.txt") as temporary:
-        write_rows(temporary, frame.rows)
-    with replacing(folder / IMAGE.format(name)) as temporary:
-        _write_png(temporary, depth_image(frame.points, frame.camera))
-    return frame.dropped
+    with replacing(folder / f"label_2/{frame.name}.txt") as temporary:
+        write_rows(temporary, rows)
+    with replacing(folder / IMAGE.format(frame.name)) as temporary:
+        _write_png(temporary, depth_image(frame.points, virtual_camera()))
 
 
 def depth_image(points: Float32[np.ndarray, "P 4"], camera: Camera) -> UInt8[np.ndarray, "H W"]:
-    """What the camera sees of the points: bright is near, black is nothing; brightness falls with the inverse depth."""
+    """Return the points as the camera sees them: brightness is linear in inverse depth, and black means no point."""
     width, height = camera.image_size
     pixels, depth = project(points[:, :3].astype(np.float64), lidar_to_image(camera.calibration))
     near, far = _DEPTHS
@@ -126,7 +133,7 @@ def _require_pillow() -> None:
     try:
         import PIL.Image  # noqa: F401
     except ModuleNotFoundError:
-        raise InputError("Depth images need pillow; get it with `pip install 'ciassd_jax[viz]'`.") from None
+        raise InputError("Depth images need pillow; run `pip install 'ciassd_jax[viz]'`.") from None
 
 
 def _write_png(path: Path, image: UInt8[np.ndarray, "H W"]) -> None:

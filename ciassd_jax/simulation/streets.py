@@ -1,20 +1,19 @@
-"""From a seed to a frame: world, scan, labels."""
+"""Synthetic frames: a random scene, its scan and its labels, from a seed and an index."""
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Int
 
 from ciassd_jax.data.frames import Dataset, Frame
-from ciassd_jax.data.kitti import crop_to_view
-from ciassd_jax.formats.kitti_boxes import rows_to_boxes
-from ciassd_jax.formats.kitti_camera import Camera
-from ciassd_jax.formats.kitti_rows import DONT_CARE, ObjectRow, difficulty_of
+from ciassd_jax.data.kitti import crop_to_view, kitti_frame
+from ciassd_jax.formats.errors import DroppedWarning
 from ciassd_jax.simulation.casting import count_rays
 from ciassd_jax.simulation.label_rows import label_rows
 from ciassd_jax.simulation.layout import Objects, World, sample_world
@@ -23,15 +22,16 @@ from ciassd_jax.simulation.solids import Solids, block
 from ciassd_jax.simulation.virtual_camera import virtual_camera
 from ciassd_jax.types import Array, PointCloud
 
-# Pairs of an object ahead and a tile of rays.
+# The capacity for pairs of an object ahead and a tile of rays.
 _MAX_PAIRS = 1024
 
 
 class Simulated(NamedTuple):
-    """A turn of the sensor through one scene.
+    """One revolution of the sensor in one scene.
 
-    Of the rays that go `through` an object's box, `arriving` are not stopped before it; objects behind the sensor have
-    none. `dropped` counts pairs of a solid and a tile of rays over capacity: parts of far solids that were not seen.
+    Of the rays `through` an object's box, the `arriving` ones are not stopped before it; both are 0 for objects behind
+    the sensor. `dropped` counts pairs of a solid and a tile of rays over capacity: parts of far solids that are not
+    seen.
     """
 
     cloud: PointCloud
@@ -41,28 +41,24 @@ class Simulated(NamedTuple):
     dropped: Int[Array, "*s"]
 
 
-class SyntheticFrame(NamedTuple):
-    """A frame as files would hold it: the full cloud, and the rows of the label."""
-
-    points: Float32[np.ndarray, "P 4"]
-    rows: list[ObjectRow]
-    camera: Camera
-    dropped: int
-
-
 def frame_key(seed: int, index: int) -> jax.Array:
-    """The key of a frame, which depends on nothing else."""
+    """Return the random key of a frame."""
     return jax.random.fold_in(jax.random.key(seed), index)
 
 
+def frame_name(index: int) -> str:
+    """Return the name of a frame, six digits as in KITTI."""
+    return f"{index:06d}"
+
+
 def simulate(key: jax.Array, lidar: Lidar) -> Simulated:
-    """Draw one scene and scan it; `vmap` over keys for several, or take `frame_key` of any."""
+    """Draw one scene and scan it. Use `vmap` for a batch of keys; `frame_key` returns that of a frame."""
     for_world, for_scan = jax.random.split(key)
     return observe(for_scan, sample_world(for_world), lidar)
 
 
 def observe(key: jax.Array, world: World, lidar: Lidar) -> Simulated:
-    """Scan a scene, and count the rays that get to its objects."""
+    """Scan a scene, and count the rays that reach its objects."""
     cloud, sight = scan(key, world, lidar)
     through, arriving, dropped = _count(world.objects, sight.range, lidar)
     return Simulated(cloud, world.objects, through, arriving, sight.dropped + dropped)
@@ -70,14 +66,17 @@ def observe(key: jax.Array, world: World, lidar: Lidar) -> Simulated:
 
 @partial(jax.jit, static_argnames="lidar")
 def _count(objects: Objects, distance: Array, lidar: Lidar) -> tuple[Array, Array, Array]:
-    """Rays through the boxes of objects ahead, those that get there, and pairs over capacity."""
+    """The rays through the boxes of objects ahead, those that reach them, and the pairs over capacity."""
     rays = lidar.rays()
     flat = distance / jnp.sqrt(1 + rays.tangent**2)[:, None]
     return count_rays(_box_solids(objects), rays, flat, _MAX_PAIRS)
 
 
-def make_frame(seed: int, index: int, lidar: Lidar | None = None) -> SyntheticFrame:
-    """Simulate frame `index` of `seed` with its labels."""
+def make_frame(seed: int, index: int, lidar: Lidar | None = None) -> tuple[Frame, int]:
+    """Simulate frame `index` of `seed`, which depends on these two numbers and the sensor alone.
+
+    Returns the frame, with the full cloud of 360 degrees and all label rows, and `Simulated.dropped`.
+    """
     simulated = jax.device_get(simulate(frame_key(seed, index), lidar or Lidar()))
     present = simulated.objects.present
     boxes = jax.tree.map(lambda leaf: leaf[present].astype(np.float64), simulated.objects.boxes)
@@ -86,30 +85,29 @@ def make_frame(seed: int, index: int, lidar: Lidar | None = None) -> SyntheticFr
     camera = virtual_camera()
     rows = label_rows(boxes, kind, through, arriving, camera)
     points = simulated.cloud.points[: simulated.cloud.count]
-    return SyntheticFrame(points, rows, camera, int(simulated.dropped))
+    return kitti_frame(frame_name(index), points, tuple(rows), camera), int(simulated.dropped)
 
 
 def open_synthetic(seed: int, frames: int, lidar: Lidar | None = None) -> Dataset:
-    """`frames` synthetic frames named 000000, 000001, ...: a data set without files, simulated as it is read.
+    """Return a data set of `frames` synthetic frames, named 000000, 000001, ..., which are simulated as they are read.
 
-    What `read` gives is what `data synth` with the same seed writes, but for the rounding of the labels' text.
+    Except for the rounding of the label's text, its frames are those that `write_synthetic` writes for the same seed.
     """
-    names = tuple(f"{index:06d}" for index in range(frames))
+    names = tuple(map(frame_name, range(frames)))
     return Dataset(names, partial(read_synthetic_frame, seed=seed, lidar=lidar or Lidar()))
 
 
 def read_synthetic_frame(name: str, *, seed: int, lidar: Lidar) -> Frame:
-    """Simulate the frame of that name, cropped to the camera's view as KITTI's frames are."""
-    frame = make_frame(seed, int(name), lidar)
-    rows = [row for row in frame.rows if row.type != DONT_CARE]
-    difficulty = np.array([difficulty_of(row) for row in rows], np.int64)
-    boxes = rows_to_boxes(rows, frame.camera.calibration)
-    points = crop_to_view(frame.points, frame.camera)
-    return Frame(name, points, boxes, tuple(row.type for row in rows), difficulty, frame.camera)
+    """Simulate the frame of that name, cropped to the camera's view; a DroppedWarning counts pairs over capacity."""
+    frame, dropped = make_frame(seed, int(name), lidar)
+    if dropped:
+        text = f"Frame {name} of seed {seed} is incomplete: {dropped} pairs of a solid and a tile are over capacity."
+        warnings.warn(text, DroppedWarning, stacklevel=2)
+    return frame._replace(points=crop_to_view(frame.points, virtual_camera()))
 
 
 def _box_solids(objects: Objects) -> Solids:
-    """The boxes of the objects ahead."""
+    """The boxes of the objects ahead of the sensor, as solids."""
 
     def build(center: Array, size: Array) -> Solids:
         return block((center[0], center[1], center[2]), (size[0], size[1], size[2]), 0)

@@ -1,4 +1,4 @@
-"""The virtual camera of synthetic frames: KITTI's of 2011-09-26, the recording day of most frames."""
+"""The virtual camera of synthetic frames: KITTI's of 2011-09-26, the day when most frames were recorded."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ciassd_jax.formats.kitti_camera import Calibration, Camera
 
 IMAGE_SIZE = (1242, 375)
 _FOCAL, _CENTER = 721.5377, (609.5593, 172.854)
-# Fourth columns of P0..P3: what the cameras' places do to the pixels.
+# The fourth columns of P0 to P3, from the positions of the cameras.
 _SHIFTS = (
     (0.0, 0.0, 0.0),
     (-387.5744, 0.0, 0.0),
@@ -33,12 +33,12 @@ _IMU_TO_LIDAR = (
 
 
 def virtual_camera() -> Camera:
-    """The left colour camera."""
+    """Return the left colour camera."""
     return Camera(Calibration(_projection(2), np.array(_RECTIFICATION), np.array(_LIDAR_TO_CAMERA)), IMAGE_SIZE)
 
 
 def calibration_text() -> str:
-    """A calibration file as KITTI writes it."""
+    """Return the text of a calibration file in KITTI's format."""
     matrices = {f"P{index}": _projection(index) for index in range(4)} | {
         "R0_rect": np.array(_RECTIFICATION),
         "Tr_velo_to_cam": np.array(_LIDAR_TO_CAMERA),

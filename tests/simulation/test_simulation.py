@@ -2,6 +2,7 @@
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,37 +18,35 @@ from ciassd_jax.formats.kitti_camera import read_calibration
 from ciassd_jax.formats.kitti_rows import read_rows
 from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.simulation import Lidar, frame_key, make_frame, open_synthetic, simulate, write_synthetic
-from ciassd_jax.simulation.casting import Hits, Rays, cast
+from ciassd_jax.simulation.casting import Rays
 from ciassd_jax.simulation.ground import Ground, cast_ground, ground_height
 from ciassd_jax.simulation.label_rows import label_rows
 from ciassd_jax.simulation.layout import Objects, World, sample_world
 from ciassd_jax.simulation.materials import material
 from ciassd_jax.simulation.road_users import CAR, CYCLIST, NUM_STYLES, PEDESTRIAN, TRUCK, VAN, person, vehicle
-from ciassd_jax.simulation.sensor import scan
+from ciassd_jax.simulation.sensor import Sight, scan
 from ciassd_jax.simulation.solids import Solids, block, column, cross, ellipsoid, extent, place, stack
 from ciassd_jax.simulation.streets import observe
 from ciassd_jax.simulation.virtual_camera import virtual_camera
 from ciassd_jax.types import Boxes
 
-# As many beams ahead as the real one has, and few columns.
+# The beams of the real sensor and few columns; every scan below has the shapes of `small_world` and runs one program.
 SMALL = Lidar(columns=512, noise=0.0, lost=0.0)
 WALL = material("wall")
-# One program for all that is tried: solids are filled up to so many.
-PADDED, PAIRS = 640, 2048
-build_person, build_vehicle = jax.jit(person), jax.jit(vehicle)
-cast_rays = jax.jit(cast, static_argnames="capacity")
+build_person, build_vehicle, extent_of = jax.jit(person), jax.jit(vehicle), jax.jit(extent)
+hit_ground, height_of = jax.jit(cast_ground), jax.jit(ground_height)
 
 
 @cache
 def small_world(seed: int = 0) -> World:
-    return sample_world(jax.random.key(seed))
+    return jax.device_get(sample_world(jax.random.key(seed)))
 
 
-def flat_ground() -> Ground:
-    zero, far = jnp.zeros(()), jnp.array(1e4)
+def flat_ground(sensor_height: float = 1.73) -> Ground:
+    zero, far = np.float32(0), np.float32(1e4)
     return Ground(
-        sensor_height=jnp.array(1.73),
-        slope=jnp.zeros(2),
+        sensor_height=np.float32(sensor_height),
+        slope=np.zeros(2, np.float32),
         bend=zero,
         yaw=zero,
         middle=zero,
@@ -56,23 +55,36 @@ def flat_ground() -> Ground:
         crossing_half=zero,
         kerb=zero,
         pavement=zero,
-        beyond=jnp.array(material("paving")),
-        shade=jnp.ones(()),
+        beyond=np.int32(material("paving")),
+        shade=np.float32(1),
         roughness=zero,
     )
 
 
-def hits_of(solids: Solids, capacity: int = PAIRS) -> Hits:
-    missing = PADDED - len(solids.yaw)
-    padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, missing)] + [(0, 0)] * (leaf.ndim - 1)), solids)
-    rays = SMALL.rays()
-    return cast_rays(padded, jnp.zeros(PADDED), rays, jnp.zeros((rays.tangent.size, rays.azimuth.size)), capacity)
+def world_of(solids: Solids, objects: Objects | None = None, ground: Ground | None = None) -> World:
+    """A world of these solids and objects, filled up to the shapes of `small_world`."""
+
+    def fill(some: Any, full: Any) -> Any:
+        return jax.tree.map(
+            lambda leaf, other: np.concatenate([leaf, np.zeros_like(other[len(leaf) :])]), jax.device_get(some), full
+        )
+
+    full = small_world()
+    none = jax.tree.map(lambda leaf: leaf[:0], full.objects)
+    return World(ground or flat_ground(), fill(solids, full.solids), fill(objects or none, full.objects))
+
+
+def look_at(solids: Solids) -> Sight:
+    """What is seen of solids alone, with the ground out of sight."""
+    return jax.device_get(scan(jax.random.key(0), world_of(solids, ground=flat_ground(1e5)), SMALL)[1])
 
 
 def distances(solids: Solids) -> np.ndarray:
-    hits = hits_of(solids)
-    assert hits.dropped == 0
-    return np.asarray(hits.distance)
+    """The horizontal distance of every ray's hit; inf for none."""
+    sight = look_at(solids)
+    assert sight.dropped == 0
+    distance = sight.range / np.sqrt(1 + np.asarray(SMALL.rays().tangent) ** 2)[:, None]
+    return np.where(distance < 100, distance, np.inf)
 
 
 def ahead(rays: Rays, elevation: float) -> tuple[int, int]:
@@ -103,7 +115,9 @@ def test_faces_lean() -> None:
 
 def test_tiles_lose_nothing() -> None:
     """Every ray tried with every solid of a street finds the same as the rays of the tiles alone."""
-    solids = jax.tree.map(lambda leaf: leaf[np.asarray(small_world().solids.present)], small_world().solids)
+    solids = jax.tree.map(lambda leaf: leaf[small_world().solids.present], small_world().solids)
+    # Rays stop at the surface of a wall.
+    solids = solids._replace(material=np.full_like(solids.material, WALL))
     rays = SMALL.rays()
     found = distances(solids)[:, ::8]
 
@@ -125,18 +139,24 @@ def test_tiles_lose_nothing() -> None:
 
 
 def test_what_is_over_capacity_is_counted() -> None:
-    walls = stack([block((10, 0, 0), (0.2, 30, 3), WALL), block((20, 0, 0), (0.2, 60, 3), WALL)])
-    few = hits_of(walls, 8)
+    near, far = block((10, 0, 0), (0.01, 30, 3), WALL), block((60, 0, 0), (0.2, 400, 6), WALL)
+    origin = np.stack([10 + 0.02 * np.arange(200), np.zeros(200), np.zeros(200)], -1).astype(np.float32)
+    walls = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (200, *leaf.shape)), jax.device_get(near))
+    walls = walls._replace(origin=origin)
+    both, many = stack([near, far]), jax.tree.map(lambda some, one: np.append(some, one[None], 0), walls, far)
+    enough, few = (look_at(some._replace(owner=np.arange(len(some.yaw), dtype=np.int32))) for some in (both, many))
+    # The far wall shows beside the near one, unless the walls between them take all pairs.
+    assert (enough.dropped, set(np.unique(enough.owner))) == (0, {-1, 0, 1})
     assert few.dropped > 0
-    assert hits_of(walls).dropped == 0
-    # The nearer wall comes first.
-    assert set(np.unique(few.solid)) == {-1, 0}
+    assert set(np.unique(few.owner)) == {-1, 0}
+    np.testing.assert_array_equal(few.owner == 0, enough.owner == 0)
 
 
 def test_flat_ground_is_met_at_the_sensor_height_over_the_tangent() -> None:
     rays = SMALL.rays()
-    flat = jnp.zeros((rays.tangent.size, rays.azimuth.size))
-    distance, cosine, _ = cast_ground(flat_ground(), rays.azimuth, rays.tangent, flat)
+    flat = np.zeros((rays.tangent.size, rays.azimuth.size), np.float32)
+    distance, cosine, _ = hit_ground(flat_ground(), rays.azimuth, rays.tangent, flat)
+    distance, cosine = np.asarray(distance), np.asarray(cosine)
     down = np.asarray(rays.tangent) < 0
     expected = np.broadcast_to(-1.73 / np.asarray(rays.tangent)[down, None], distance[down].shape)
     np.testing.assert_allclose(distance[down], expected, rtol=1e-5)
@@ -146,10 +166,11 @@ def test_flat_ground_is_met_at_the_sensor_height_over_the_tangent() -> None:
 
 def test_sloping_ground_with_kerbs_is_met_on_its_surface() -> None:
     ground, rays = small_world().ground, SMALL.rays()
-    distance, _, _ = cast_ground(ground, rays.azimuth, rays.tangent, jnp.zeros((rays.tangent.size, 512)))
-    distance = jnp.where(distance < 60, distance, jnp.nan)
-    x, y = distance * jnp.cos(rays.azimuth)[None], distance * jnp.sin(rays.azimuth)[None]
-    above = np.asarray(distance * rays.tangent[:, None] - ground_height(ground, x, y))
+    flat = np.zeros((rays.tangent.size, rays.azimuth.size), np.float32)
+    distance = np.asarray(hit_ground(ground, rays.azimuth, rays.tangent, flat)[0])
+    distance = np.where(distance < 60, distance, np.nan)
+    x, y = distance * np.cos(rays.azimuth)[None], distance * np.sin(rays.azimuth)[None]
+    above = distance * np.asarray(rays.tangent)[:, None] - np.asarray(height_of(ground, x, y))
     above = above[np.isfinite(above)]
     assert (abs(above) < 1e-3).mean() > 0.95
     assert abs(above).max() < ground.kerb + 1e-3
@@ -170,12 +191,11 @@ def test_objects_fill_their_boxes(kind: int, size: tuple[float, float, float]) -
     build = build_person if kind in (PEDESTRIAN, CYCLIST) else build_vehicle
     length, width, height = size
     for style in np.random.default_rng(0).uniform(size=(8, NUM_STYLES)).astype(np.float32):
-        solids = build(jnp.array(size), jnp.array(kind), jnp.array(style))
-        front, rear, side, high, low = extent(solids)
-        x, y, z = np.moveaxis(np.asarray(solids.origin), -1, 0)
-        real = np.asarray(solids.present)
+        solids = jax.device_get(build(np.float32(size), np.int32(kind), style))
+        front, rear, side, high, low = jax.device_get(extent_of(solids))
+        x, y, z = np.moveaxis(solids.origin, -1, 0)
         edges = (x + front, -x + rear, abs(y) + side, z + high, -z + low)
-        reach = [float(np.max(np.asarray(edge)[real])) for edge in edges]
+        reach = [float(np.max(edge[solids.present])) for edge in edges]
         limits = (length / 2, length / 2, width / 2, height, 0.0)
         assert all(found < limit + 0.1 for found, limit in zip(reach, limits, strict=True)), reach
         assert all(found > limit - 0.16 for found, limit in zip(reach, limits, strict=True)), reach
@@ -184,11 +204,11 @@ def test_objects_fill_their_boxes(kind: int, size: tuple[float, float, float]) -
 def test_points_of_objects_lie_in_their_boxes() -> None:
     world = small_world()
     _, sight = scan(jax.random.key(1), world, SMALL)
-    rays, owner = SMALL.rays(), np.asarray(sight.owner)
-    flat = np.asarray(sight.range / jnp.sqrt(1 + rays.tangent**2)[:, None])
+    rays, owner = jax.device_get(SMALL.rays()), np.asarray(sight.owner)
+    flat = np.asarray(sight.range) / np.sqrt(1 + rays.tangent**2)[:, None]
     flat = np.where(np.isfinite(flat), flat, 0)
     x, y = flat * np.cos(rays.azimuth)[None], flat * np.sin(rays.azimuth)[None]
-    places = np.stack([x, y, flat * np.asarray(rays.tangent)[:, None]], -1)
+    places = np.stack([x, y, flat * rays.tangent[:, None]], -1)
     seen = np.unique(owner[owner >= 0])
     assert len(seen) >= 3
     for index in seen:
@@ -201,19 +221,20 @@ def test_points_of_objects_lie_in_their_boxes() -> None:
 
 def street_with(more: Solids) -> World:
     """A car 15 m ahead on flat ground, and something else."""
-    size = jnp.array([4.0, 1.7, 1.5])
-    style = jnp.full(NUM_STYLES, 0.5)
-    car = place(vehicle(size, jnp.array(CAR), style), jnp.array([15.0, 0.0, -1.73]), jnp.zeros(()))
-    car = car._replace(owner=jnp.zeros_like(car.owner))
-    boxes = Boxes(jnp.array([[15.0, 0.0, -0.98]]), size[None], jnp.zeros(1))
-    solids = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), car, stack([more]))
-    return World(flat_ground(), solids, Objects(boxes, jnp.array([CAR]), jnp.array([True])))
+    size = np.float32([4.0, 1.7, 1.5])
+    parts = build_vehicle(size, np.int32(CAR), np.full(NUM_STYLES, 0.5, np.float32))
+    car = place(parts, np.float32([15.0, 0.0, -1.73]), np.float32(0))
+    car = car._replace(owner=np.zeros_like(car.owner))
+    boxes = Boxes(np.float32([[15.0, 0.0, -0.98]]), size[None], np.zeros(1, np.float32))
+    solids = jax.tree.map(lambda some, one: np.append(some, one[None], 0), car, more)
+    return world_of(solids, Objects(boxes, np.int32([CAR]), np.array([True])))
 
 
 def labels_of(world: World) -> list:
     seen = jax.device_get(observe(jax.random.key(0), world, SMALL))
-    boxes = jax.tree.map(lambda leaf: leaf.astype(np.float64), seen.objects.boxes)
-    return label_rows(boxes, seen.objects.kind, seen.through, seen.arriving, virtual_camera())
+    real = seen.objects.present
+    boxes = jax.tree.map(lambda leaf: leaf[real].astype(np.float64), seen.objects.boxes)
+    return label_rows(boxes, seen.objects.kind[real], seen.through[real], seen.arriving[real], virtual_camera())
 
 
 def test_a_car_in_the_open_is_labelled_as_visible() -> None:
@@ -252,10 +273,10 @@ def test_few_rays_make_no_label_but_a_region_not_to_care_about() -> None:
 def test_objects_stand_apart_on_the_ground() -> None:
     for seed in range(3):
         world = small_world(seed)
-        present = np.asarray(world.objects.present)
-        boxes = jax.tree.map(lambda leaf, present=present: np.asarray(leaf)[present], world.objects.boxes)
+        boxes = jax.tree.map(lambda leaf, present=world.objects.present: leaf[present], world.objects.boxes)
         center, bottom = boxes.center, boxes.center[:, 2] - boxes.size[:, 2] / 2
-        np.testing.assert_allclose(bottom, ground_height(world.ground, center[:, 0], center[:, 1]), atol=1e-4)
+        height = jax.vmap(ground_height, (None, 0, 0))(world.ground, center[:, 0], center[:, 1])
+        np.testing.assert_allclose(bottom, height, atol=1e-4)
         grown = boxes._replace(size=boxes.size * np.array([[1, 1, 99]], np.float32))
         inside = points_in_boxes(np.asarray(center), grown)
         assert (inside.sum(1) == 1).all()
@@ -263,14 +284,14 @@ def test_objects_stand_apart_on_the_ground() -> None:
 
 
 def test_a_frame_depends_on_its_seed_and_index_alone() -> None:
-    first, again, other = make_frame(3, 5, SMALL), make_frame(3, 5, SMALL), make_frame(3, 6, SMALL)
+    first, again, other = (make_frame(3, index, SMALL)[0] for index in (5, 5, 6))
     np.testing.assert_array_equal(first.points, again.points)
     assert first.rows == again.rows
     assert len(first.points) != len(other.points)
 
 
 def test_a_cloud_is_what_a_lidar_gives() -> None:
-    points = make_frame(0, 0, SMALL).points
+    points = make_frame(0, 0, SMALL)[0].points
     rays = 64 * SMALL.columns
     assert 0.5 * rays < len(points) < rays
     assert np.isfinite(points).all()
@@ -301,6 +322,10 @@ def test_a_folder_gives_back_the_frames(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read.points, made.points)
         assert (read.names, read.difficulty.tolist()) == (made.names, made.difficulty.tolist())
         np.testing.assert_allclose(read.boxes.to_array(), made.boxes.to_array(), atol=1e-3)
+        assert read.rows is not None
+        assert made.rows is not None
+        assert [(row.type, row.occluded) for row in read.rows] == [(row.type, row.occluded) for row in made.rows]
+        np.testing.assert_allclose([row.bbox for row in read.rows], [row.bbox for row in made.rows], atol=1e-4)
     assert pad_frame(direct.read(0), 0, tiny()).truth.count == len(direct.read(0).names)
     report = check_dataset(tmp_path / "five")
     assert [finding.text for finding in report.findings if finding.serious] == []
@@ -335,9 +360,9 @@ def test_the_virtual_camera_is_that_of_its_file(tmp_path: Path) -> None:
 
 def test_a_folder_that_is_not_its_own_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("precious")
-    with pytest.raises(InputError, match=r"is not empty; name another folder, or replace .* with --overwrite"):
+    with pytest.raises(InputError, match=r"not empty.*overwrite"):
         write_synthetic(tmp_path, frames=1, seed=0, lidar=SMALL)
-    with pytest.raises(InputError, match="was not written by `ciassd data synth`, so it stays"):
+    with pytest.raises(InputError, match="was not written by"):
         write_synthetic(tmp_path, frames=1, seed=0, lidar=SMALL, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
@@ -350,7 +375,7 @@ def test_overwriting_leaves_no_old_frame(tmp_path: Path) -> None:
 
 def test_pillow_is_asked_for_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "PIL.Image", None)
-    with pytest.raises(InputError, match=r"get it with `pip install 'ciassd_jax\[viz\]'`"):
+    with pytest.raises(InputError, match=r"pip install 'ciassd_jax\[viz\]'"):
         write_synthetic(tmp_path / "out", frames=1, seed=0, lidar=SMALL)
     assert not (tmp_path / "out").exists()
 
