@@ -22,7 +22,7 @@ from ciassd_jax.formats.kitti_camera import view_planes
 from ciassd_jax.inference.detector import pad_to_bucket
 from ciassd_jax.inference.postprocess import postprocess, select_candidates
 from ciassd_jax.inference.results import frame_result
-from ciassd_jax.inference.scoring import ScoredFrame, describe_dropped, labelled_frames, score_frame, score_frames
+from ciassd_jax.inference.scoring import Scored, describe_dropped, labelled_frames, score_frame, score_frames
 from ciassd_jax.model.anchors import make_anchors
 from ciassd_jax.model.network import RawPredictions, predict_raw
 from ciassd_jax.ops.camera import ANYWHERE
@@ -91,7 +91,7 @@ def _predictions(variables: Variables, config: Config, dataset: Dataset) -> Iter
         yield Predicted(frame, truth, cloud, _predict_raw(variables, cloud, config))
 
 
-def _score(one: Predicted, config: Config, settings: Mapping[str, DetectionConfig]) -> dict[str, ScoredFrame]:
+def _score(one: Predicted, config: Config, settings: Mapping[str, DetectionConfig]) -> dict[str, Scored]:
     config = config.for_inference()
     planes = ANYWHERE if one.frame.camera is None else view_planes(one.frame.camera)
     scored = {}
@@ -101,7 +101,7 @@ def _score(one: Predicted, config: Config, settings: Mapping[str, DetectionConfi
     return scored
 
 
-def _evaluate(frames: Sequence[Mapping[str, ScoredFrame]]) -> dict[str, Evaluation]:
+def _evaluate(frames: Sequence[Mapping[str, Scored]]) -> dict[str, Evaluation]:
     scored = {name: [frame[name] for frame in frames] for name in frames[0]}
     # Most settings drop the same: warn once.
     for dropped in sorted({describe_dropped(of_setting) for of_setting in scored.values()} - {""}):

@@ -44,10 +44,10 @@ def run(study: Study) -> Report:
             rows.append(
                 {"modules": title, **precisions([one[title] for one in found]), "paper, 3D R11 moderate": paper}
             )
-    return Report("Table 4: the modules", rows, (_order(rows),), {"": plot_bars(rows, "3D R40 moderate")})
+    return Report("Table 4: the modules", rows, (judge_order(rows),), {"": plot_bars(rows, "3D R40 moderate")})
 
 
-def _order(rows: list[dict]) -> str:
+def judge_order(rows: list[dict]) -> str:
     """Say whether each row of the paper's table improves on the row above, on average over the seeds."""
     steps = [row for row in rows if not row["modules"].startswith("...")]
     means = [sum(row["3D R40 moderate"]) / len(row["3D R40 moderate"]) for row in steps]
