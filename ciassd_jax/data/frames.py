@@ -14,7 +14,7 @@ from jaxtyping import Float32, Int
 from ciassd_jax.formats.custom_rows import CustomRow
 from ciassd_jax.formats.errors import FormatWarning, Pathlike
 from ciassd_jax.formats.kitti_camera import Camera
-from ciassd_jax.formats.kitti_rows import ObjectRow
+from ciassd_jax.formats.kitti_rows import DONT_CARE, ObjectRow
 from ciassd_jax.formats.points import scale_intensity
 from ciassd_jax.types import Boxes
 
@@ -38,6 +38,11 @@ class Frame(NamedTuple):
     difficulty: Int[np.ndarray, " G"]
     camera: Camera | None
     rows: tuple[ObjectRow, ...] | tuple[CustomRow, ...] | None = None
+
+    @property
+    def objects(self) -> list[ObjectRow | CustomRow]:
+        """The rows of the objects, in the order of `boxes`: all but DontCare."""
+        return [row for row in self.rows or () if isinstance(row, CustomRow) or row.type != DONT_CARE]
 
 
 @dataclass(frozen=True)

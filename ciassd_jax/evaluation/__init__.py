@@ -1,4 +1,4 @@
-"""Evaluation by KITTI's official rules: NumPy in float64, without a device."""
+"""Evaluation by KITTI's official rules, in float64 NumPy."""
 
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
 from ciassd_jax.evaluation.report import format_block, format_json, format_report, format_tables, to_json

@@ -1,4 +1,4 @@
-"""AP of parts of a set, by distance and by number of points, and how well confidence tells overlap."""
+"""AP by distance and by number of points, and the correlation of confidence and overlap."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from ciassd_jax.evaluation.kitti_ap import LIMITS, Curve, Evaluand, Within, is_evaluated, trace_levels
 from ciassd_jax.evaluation.overlap import Geometry
 
-# Where parts begin; the last one has no end.
+# Lower ends of the intervals; the last interval is unbounded.
 DISTANCES = (0, 20, 40)
 POINTS = (0, 20, 100)
 
 
 class Row(NamedTuple):
-    """The curves of a class, easy, moderate and hard, for the objects in one part of the set."""
+    """The easy, moderate and hard curves of a class for the objects in one interval, `part`."""
 
     name: str
     geometry: Geometry
@@ -25,14 +25,14 @@ class Row(NamedTuple):
 
 
 def rows_by_distance(evaluand: Evaluand) -> list[Row]:
-    """Rows of every evaluated class by the distance in the plane from the sensor, in metres."""
+    """Return rows of every evaluated class by the horizontal distance from the sensor, in metres."""
     truths, detections = evaluand.truths.boxes.center, evaluand.detections.boxes.center
     distances = np.hypot(truths[:, 0], truths[:, 1]), np.hypot(detections[:, 0], detections[:, 1])
     return _rows(evaluand, *distances, DISTANCES, "m")
 
 
 def rows_by_points(evaluand: Evaluand) -> list[Row]:
-    """Rows by the number of points in a box; none unless it is known of labels and detections."""
+    """Return rows by the number of points in a box, or none if it is unknown for labels or detections."""
     points, found = evaluand.truths.points, evaluand.detections.points
     if (points < 0).any() or (found < 0).any():
         return []
@@ -40,10 +40,10 @@ def rows_by_points(evaluand: Evaluand) -> list[Row]:
 
 
 def correlation(evaluand: Evaluand, name: str) -> float:
-    """Pearson's correlation of score and 3D overlap over the detections of a class.
+    """Return Pearson's correlation of score and 3D overlap over the detections of a class.
 
-    A detection's overlap is its largest with a label of the class, whatever the difficulty; those that overlap none
-    are left out, as they may be of unlabelled objects. NaN where fewer than two are left or one quantity is constant.
+    A detection's overlap is its largest with a label of the class, of any difficulty. Detections that overlap none are
+    left out, because their objects may be unlabelled. NaN as in `pearson`.
     """
     pairs = evaluand.shared["3d"]
     same = evaluand.truths.types[pairs.first] == name.lower()
@@ -55,7 +55,7 @@ def correlation(evaluand: Evaluand, name: str) -> float:
 
 
 def pearson(first: np.ndarray, second: np.ndarray) -> float:
-    """Pearson's correlation; NaN for fewer than two values and where one of the two is constant."""
+    """Return Pearson's correlation; NaN for fewer than two values and for constant ones."""
     if len(first) < 2 or np.ptp(first) == 0 or np.ptp(second) == 0:
         return float("nan")
     return float(np.corrcoef(first, second)[0, 1])

@@ -1,30 +1,102 @@
-"""The check of a whole data set, before a training finds out."""
+"""The check of a labelled data set before training: files, rows, amounts, and the score of the labels themselves."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Int
 
 from ciassd_jax.config import Config, GridConfig
-from ciassd_jax.data.custom import PLACES as CUSTOM_PLACES
-from ciassd_jax.data.folders import find_root, is_custom
-from ciassd_jax.data.frames import clean_points
-from ciassd_jax.data.kitti import IMAGE, crop_to_view, crop_without_images, kitti_folder
+from ciassd_jax.data.custom import read_custom_frame
+from ciassd_jax.data.folders import find_root, frame_files, is_custom
+from ciassd_jax.data.frames import Frame
+from ciassd_jax.data.kitti import crop_without_images, read_kitti_frame
 from ciassd_jax.data.splits import ALL, Places, find_file, listed_names, missing_files, repeated_names
-from ciassd_jax.evaluation.check_labels import check_object, check_projection, check_types, read_labelled
-from ciassd_jax.evaluation.findings import CheckedFrame, Finding, Labelled, Report, TypeSummary
+from ciassd_jax.evaluation.kitti_ap import LIMITS, METRICS, Metric, possible_precision
+from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
+from ciassd_jax.evaluation.summary import evaluate
+from ciassd_jax.formats.custom_rows import CustomRow
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike
-from ciassd_jax.formats.kitti_camera import Camera, read_camera
-from ciassd_jax.formats.points import read_points
+from ciassd_jax.formats.kitti_boxes import boxes_to_rows
+from ciassd_jax.formats.kitti_rows import ObjectRow
 from ciassd_jax.ops.footprints import points_in_boxes
-from ciassd_jax.types import Boxes
 
-# A cloud with less than this part of the usual number of points is odd.
+# Labels are rounded to two decimals, so that half a turn may read 3.15.
+_MAX_HEADING = math.pi + 0.01
+# Median length / width below which a type has them swapped, and above which a single object may have.
+_WIDE, _LONG = 1 / 1.2, 1.5
+# Fewer objects of a type have no typical shape and height.
+_FEW = 5
+# Least median overlap of labelled and projected image boxes, which are drawn by hand: one of 155 real frames has 0.5.
+_SAME = 0.25
+# Least fraction of the median number of points that a cloud should have.
 _SPARSE = 0.1
+
+
+class Finding(NamedTuple):
+    """One sentence: file, line, problem, remedy. Serious findings must be corrected, the others are worth a look."""
+
+    kind: str
+    serious: bool
+    text: str
+
+
+class Checked(NamedTuple):
+    """A frame that could be read, without its points: their number, those inside each box, and the occupied voxels."""
+
+    frame: Frame
+    points: int
+    inside: Int[np.ndarray, " G"]
+    voxels: int
+
+
+class TypeSummary(NamedTuple):
+    """The objects of one type: their number, how many are out of the grid's range, and how many hold no point.
+
+    `size` (length, width, height) and `center_z` are medians in metres.
+    """
+
+    objects: int
+    out_of_range: int
+    without_points: int
+    size: tuple[float, float, float]
+    center_z: float
+
+
+class LabelScore(NamedTuple):
+    """AP R40 in percent of the labels as detections, for one class and metric, at each difficulty.
+
+    `possible` is what the official rule gives for this number of objects if all are found: 100 from CURVE_POINTS on.
+    """
+
+    name: str
+    metric: Metric
+    objects: tuple[int, ...]
+    score: tuple[float, ...]
+    possible: tuple[float, ...]
+
+
+class _Objects(NamedTuple):
+    """The objects of one type: rows, boxes, and numbers of points inside."""
+
+    rows: tuple[ObjectRow | CustomRow, ...]
+    boxes: Float[np.ndarray, "G 7"]
+    inside: Int[np.ndarray, " G"]
+
+
+class Report(NamedTuple):
+    """The check of a data set; `types` are in descending order of their numbers of objects."""
+
+    findings: tuple[Finding, ...]
+    frames: tuple[Checked, ...]
+    types: dict[str, TypeSummary]
+    scores: tuple[LabelScore, ...]
 
 
 def check_dataset(
@@ -35,161 +107,236 @@ def check_dataset(
     image_size: tuple[int, int] | None = None,
     track: Callable[[Sequence[str]], Iterable[str]] = iter,
 ) -> Report:
-    """Read every frame of a split, or without one all that are there and the split files, and say what is odd.
+    """Read all frames of a split, or, by default, all existing frames and split files, and report what is wrong.
 
-    `config` says the grid, the classes and the capacities (the paper's without one); `root` and `image_size` are as
-    for `open_dataset`; `track` sees the frames go by, for a progress bar. Raises InputError where there is no frame.
+    `config` (default: the paper's) gives the grid, the classes and the capacities; `root` and `image_size` are those
+    of `open_dataset`; `track` wraps the iteration over the frames, for a progress bar. Raises InputError without any
+    frame to read.
     """
-    config, folder = config or Config(), find_root(root)
-    root, places = folder, CUSTOM_PLACES
-    if not is_custom(root):
-        folder, places = kitti_folder(root, split or ALL)
+    config, root = config or Config(), find_root(root)
+    folder, places = frame_files(root, split or ALL)
     listed, source = listed_names(root, split or ALL, folder, places)
     needed = [paths for kind, paths in places.items() if kind != "label"]
     names = [name for name in dict.fromkeys(listed) if all(find_file(folder, paths, name) for paths in needed)]
     if not names:
-        raise InputError(f"{source} names no frame that is there; check the path.")
-    findings = list(_check_names(listed, source, folder, places))
-    findings += [] if split else _check_split_files(root)
-    if not is_custom(root) and image_size is None and (guess := crop_without_images(folder, names)):
-        findings.append(Finding("image size", False, guess))
+        raise InputError(f"{source} names no frame that exists; check the path.")
+    findings = [*_check_names(listed, source, folder, places), *([] if split else _check_split_files(root))]
+    read: Callable[..., Frame] = partial(read_custom_frame, root=root)
+    if not is_custom(root):
+        read = partial(read_kitti_frame, folder=folder, image_size=image_size)
+        if image_size is None and (guess := crop_without_images(folder, names)):
+            findings.append(Finding("image size", False, guess))
     frames = []
     for name in track(names):
-        frame, found = _check_frame(name, folder, places, config.grid, image_size)
-        findings += found
-        frames += [frame] if frame else []
-    findings += check_types([labelled for frame in frames for labelled in frame.objects], config)
-    findings += _check_amounts(frames, config)
-    return Report(tuple(findings), tuple(frames), _summarise(frames, config.grid))
+        cloud, label = (find_file(folder, places.get(kind, ()), name) for kind in ("cloud", "label"))
+        try:
+            frame = _read(partial(read, name, labelled=label is not None), findings)
+        except InputError as error:
+            findings.append(Finding("unreadable file", True, str(error)))
+            continue
+        inside = np.asarray(points_in_boxes(frame.points, frame.boxes)).sum(-1)
+        findings += _check_frame(frame, inside, cloud)
+        count, voxels = len(frame.points), _count_voxels(frame.points, config.grid)
+        frames.append(Checked(frame._replace(points=np.zeros((0, 4), np.float32)), count, inside, voxels))
+    types, scores = _by_type(frames), _score_labels([one.frame for one in frames])
+    for name, objects in types.items():
+        findings += _check_type(name, objects, config)
+    findings += [*_check_amounts(frames, config), *_check_scores(scores)]
+    summaries = {name: _summarise(objects, config.grid) for name, objects in types.items()}
+    return Report(tuple(findings), tuple(frames), summaries, tuple(scores))
+
+
+def _read(read: Callable[..., Frame], findings: list[Finding]) -> Frame:
+    """Read a frame; malformed label lines and warnings become findings."""
+    problems: list[InputError] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", FormatWarning)
+        frame = read(problems=problems)
+    findings += [Finding("points", False, str(one.message)) for one in caught]
+    findings += [Finding("label row", True, str(problem)) for problem in problems]
+    return frame
 
 
 def _check_names(names: Sequence[str], source: str, folder: Path, places: Places) -> Iterator[Finding]:
-    """Names that are listed twice or whose files are missing."""
-    for sentence in repeated_names(names):
-        yield Finding("split", True, f"{source}: {sentence}; list it once.")
-    for sentence in missing_files(folder, places, names):
-        yield Finding("missing file", True, f"{source}: {sentence}; copy them, or take the frames off the list.")
+    for clause in repeated_names(names):
+        yield Finding("split", True, f"{source}: {clause}; list it once.")
+    for clause in missing_files(folder, places, names):
+        yield Finding("missing file", True, f"{source}: {clause}; copy them, or remove the frames from the list.")
 
 
 def _check_split_files(root: Path) -> Iterator[Finding]:
-    """All of ImageSets: each file by itself, and whether train and val share frames."""
+    """Check each file of ImageSets, and that train and val share no frame."""
     splits = {}
     for path in sorted((root / "ImageSets").glob("*.txt")):
-        folder, places = (root, CUSTOM_PLACES) if is_custom(root) else kitti_folder(root, path.stem)
+        folder, places = frame_files(root, path.stem)
         names, source = listed_names(root, path.stem, folder, places)
         splits[path.stem] = set(names)
         yield from _check_names(names, source, folder, {"cloud": places["cloud"]})
     shared = sorted(splits.get("train", set()) & splits.get("val", set()))
     if shared:
-        yield Finding(
-            "split",
-            True,
-            f"{root / 'ImageSets'}: train.txt and val.txt share {len(shared)} frames, the first {shared[0]}; take them "
-            "off one of the two.",
-        )
+        text = f"{root / 'ImageSets'}: train.txt and val.txt share {len(shared)} frames, the first {shared[0]}"
+        yield Finding("split", True, f"{text}; remove them from one of the two.")
 
 
-def _check_frame(
-    name: str, folder: Path, places: Places, grid: GridConfig, image_size: tuple[int, int] | None
-) -> tuple[CheckedFrame | None, list[Finding]]:
-    """Everything about one frame whose cloud is there; no frame where its cloud or calibration cannot be read."""
-    try:
-        camera = None
-        if "calibration" in places:
-            camera = read_camera(folder / f"calib/{name}.txt", folder / IMAGE.format(name), image_size)
-        points, findings = _read_cloud(name, folder, places, camera)
-    except InputError as error:
-        return None, [Finding("unreadable file", True, str(error))]
-    label = find_file(folder, places.get("label", ()), name)
-    objects: list[Labelled] = []
-    if label is not None:
-        objects, more = read_labelled(label, camera and camera.calibration)
-        findings += more
-    findings += [finding for labelled in objects for finding in check_object(labelled)]
-    if camera is not None:
-        findings += check_projection(objects, camera)
-    boxes = Boxes.from_array(np.array([labelled.box for labelled in objects]).reshape(-1, 7))
-    inside = np.asarray(points_in_boxes(points, boxes)).sum(-1)
-    findings += [
-        Finding("no point", False, f"{labelled.place}: no point lies inside this {labelled.type}; check its box.")
-        for labelled, count in zip(objects, inside, strict=True)
-        if not count
-    ]
-    return CheckedFrame(name, camera, tuple(objects), inside, len(points), _count_voxels(points, grid)), findings
+def _check_frame(frame: Frame, inside: Int[np.ndarray, " G"], cloud: Path | None) -> Iterator[Finding]:
+    if ((frame.points[:, 3] < 0) | (frame.points[:, 3] > 1)).any():
+        yield Finding("intensity", False, f"{cloud}: intensities are not all in [0, 1]; scale them.")
+    if not len(frame.points):
+        yield Finding("few points", True, f"{cloud}: no point is left; check the calibration and the cloud.")
+    places: dict[ObjectRow | CustomRow, str] = {}
+    for row in frame.rows or ():
+        if (first := places.setdefault(row._replace(place=""), row.place)) != row.place:
+            text = f"{row.place}: the same object as in {first}; remove one of the two lines."
+            yield Finding("repeated row", True, text)
+    for row, size, count in zip(frame.objects, frame.boxes.size, inside, strict=True):
+        yield from _check_row(row, size)
+        if not count:
+            yield Finding("no point", False, f"{row.place}: no point lies inside this {row.type}; check its box.")
+    if frame.camera is not None:
+        yield from _check_projection(frame)
 
 
-def _read_cloud(
-    name: str, folder: Path, places: Places, camera: Camera | None
-) -> tuple[Float32[np.ndarray, "P 4"], list[Finding]]:
-    """The frame's points as training would see them, and what is odd about their values."""
-    path = find_file(folder, places["cloud"], name)
-    assert path is not None
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", FormatWarning)
-        points = clean_points(read_points(path), path)
-    findings = [Finding("points", False, str(one.message)) for one in caught]
-    if ((points[:, 3] < 0) | (points[:, 3] > 1)).any():
-        text = f"{path}: intensities are not all in [0, 1]; scale them so."
-        findings.append(Finding("intensity", False, text))
-    if camera is not None and path.parent.name != "velodyne_reduced":
-        points = crop_to_view(points, camera)
-    if not len(points):
-        findings.append(Finding("few points", True, f"{path}: no point is left; check the calibration and the cloud."))
-    return points, findings
+def _check_row(row: ObjectRow | CustomRow, size: Float[np.ndarray, 3]) -> Iterator[Finding]:
+    place = row.place
+    if (size <= 0).any():
+        edges = " x ".join(f"{edge:g}" for edge in size)
+        yield Finding("size", True, f"{place}: the size {edges} is not positive; correct or remove the line.")
+    heading = row.box[6] if isinstance(row, CustomRow) else row.rotation_y
+    if abs(heading) > _MAX_HEADING:
+        yield Finding("heading", True, f"{place}: the heading {heading:g} is outside [-pi, pi]; wrap it, in radians.")
+    if isinstance(row, CustomRow):
+        return
+    if row.bbox[2] <= row.bbox[0] or row.bbox[3] <= row.bbox[1]:
+        yield Finding("image box", True, f"{place}: the image box is empty; write left, top, right, bottom in pixels.")
+    if not 0 <= row.truncated <= 1 or row.occluded not in range(4):
+        yield Finding("occlusion", True, f"{place}: truncation must lie in 0..1 and occlusion be 0, 1, 2 or 3.")
+    if row.score is not None:
+        yield Finding("score", False, f"{place}: a label has no score; remove the last column.")
 
 
-def _count_voxels(points: Float32[np.ndarray, "P 4"], grid: GridConfig) -> int:
-    """How many voxels of the grid are occupied."""
-    shape = np.array(grid.cells)
+def _check_projection(frame: Frame) -> Iterator[Finding]:
+    """Compare the image boxes of fully visible objects with the projections of their boxes."""
+    pairs = [(row, seen) for row, seen in _projected(frame) if row.truncated == 0 and row.occluded == 0]
+    overlap = float(np.median([_image_overlap(row.bbox, seen.bbox) if seen else 0.0 for row, seen in pairs] or [1.0]))
+    if overlap < _SAME:
+        text = f"the boxes project elsewhere than their image boxes lie (overlap {overlap:.2f})"
+        place = f"{pairs[0][0].place} and others"
+        yield Finding("projection", False, f"{place}: {text}; check that label and calibration belong together.")
+
+
+def _projected(frame: Frame) -> list[tuple[ObjectRow, ObjectRow | None]]:
+    """Return each object's row, and the row made of its box in the LiDAR frame if that is in the image."""
+    assert frame.camera is not None
+    rows = cast(list[ObjectRow], frame.objects)
+    made, kept = boxes_to_rows(frame.boxes, np.ones(len(rows)), frame.names, *frame.camera)
+    seen = dict(zip(kept.tolist(), made, strict=True))
+    return [(row, seen.get(index)) for index, row in enumerate(rows)]
+
+
+def _image_overlap(a: Sequence[float], b: Sequence[float]) -> float:
+    """Return the intersection over union of two image boxes (x1, y1, x2, y2); 0 if one of them is empty."""
+    shared = math.prod(max(min(a[i + 2], b[i + 2]) - max(a[i], b[i]), 0) for i in (0, 1))
+    areas = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (a, b))
+    return shared / (areas - shared) if shared else 0.0
+
+
+def _by_type(frames: Sequence[Checked]) -> dict[str, _Objects]:
+    """Return the objects of each type, the most frequent first."""
+    found: dict[str, list[tuple]] = {}
+    for one in frames:
+        for labelled in zip(one.frame.objects, np.asarray(one.frame.boxes.to_array()), one.inside, strict=True):
+            found.setdefault(labelled[0].type, []).append(labelled)
+    columns = {name: zip(*found[name], strict=True) for name in sorted(found, key=lambda name: -len(found[name]))}
+    return {name: _Objects(next(column), *map(np.array, column)) for name, column in columns.items()}
+
+
+def _check_type(name: str, objects: _Objects, config: Config) -> Iterator[Finding]:
+    """Check the objects of a type together: length and width swapped, heights."""
+    places, boxes = [row.place for row in objects.rows], objects.boxes
+    ratio = boxes[:, 3] / np.where(boxes[:, 4] > 0, boxes[:, 4], np.inf)
+    if len(boxes) >= _FEW and np.median(ratio) < _WIDE:
+        text = f"{(ratio < 1).sum()} of {len(boxes)} objects of type {name} are wider than long"
+        yield Finding("swapped", True, f"{places[0]} and others: {text}; swap their length and width.")
+    elif len(boxes) >= _FEW and np.median(ratio) > _LONG:
+        for index in np.flatnonzero(ratio < 1):
+            text = f"this {name} is {boxes[index, 3]:g} m long and {boxes[index, 4]:g} m wide; swap the two."
+            yield Finding("swapped", False, f"{places[index]}: {text}")
+    low, high, typical = config.grid.minimum[2], config.grid.maximum[2], np.median(boxes[:, 2])
+    for one in config.classes:
+        if name not in (one.name, *one.similar):
+            continue
+        for index in np.flatnonzero((boxes[:, 2] < low) | (boxes[:, 2] > high)):
+            text = f"the centre of this {name} is at z = {boxes[index, 2]:.2f}, outside the grid's {low:g}..{high:g} m"
+            yield Finding("height", False, f"{places[index]}: {text}; check the line, or choose the grid for it.")
+        if name == one.name and len(boxes) >= _FEW and abs(typical - one.center_z) > one.height / 2:
+            text = f"the centres of type {name} are typically at z = {typical:.2f}, but its anchors at {one.center_z:g}"
+            remedy = "check that z is the middle of the box, or set the class's center_z."
+            yield Finding("height", False, f"{places[0]} and others: {text}; {remedy}")
+
+
+def _summarise(objects: _Objects, grid: GridConfig) -> TypeSummary:
+    center = objects.boxes[:, :3]
+    outside = ((center < np.array(grid.minimum)) | (center > np.array(grid.maximum))).any(-1)
+    z, length, width, height = np.median(objects.boxes[:, 2:6], axis=0).tolist()
+    return TypeSummary(len(center), int(outside.sum()), int((objects.inside == 0).sum()), (length, width, height), z)
+
+
+def _count_voxels(points: Float[np.ndarray, "P 4"], grid: GridConfig) -> int:
+    """Return the number of occupied voxels."""
     cells = np.floor((points[:, :3] - np.array(grid.minimum, np.float32)) / np.array(grid.voxel_size, np.float32))
-    inside = ((cells >= 0) & (cells < shape)).all(-1)
-    return len(np.unique(np.ravel_multi_index(tuple(cells[inside].astype(np.int64).T), tuple(shape))))
+    inside = ((cells >= 0) & (cells < np.array(grid.cells))).all(-1)
+    return len(np.unique(np.ravel_multi_index(tuple(cells[inside].astype(np.int64).T), tuple(grid.cells))))
 
 
-def _check_amounts(frames: Sequence[CheckedFrame], config: Config) -> Iterator[Finding]:
-    """Boxes that mostly hold no point, clouds far smaller than usual, and frames beyond a capacity of the config."""
-    inside = [count for frame in frames for count in frame.inside.tolist()]
-    if inside.count(0) > len(inside) / 2:
-        text = (
-            f"{inside.count(0)} of {len(inside)} boxes hold no point; check that labels, calibration and clouds belong "
-            "together, and the axes of the boxes."
-        )
-        yield Finding("no point", True, text)
-    usual = float(np.median([frame.points for frame in frames])) if frames else 0
-    for frame in frames:
-        if 0 < frame.points < _SPARSE * usual:
-            text = f"Frame {frame.name}: {frame.points} points where {usual:.0f} are usual; check its cloud."
+def _check_amounts(frames: Sequence[Checked], config: Config) -> Iterator[Finding]:
+    """Find boxes that mostly hold no point, clouds far smaller than usual, and frames over a capacity."""
+    inside = np.concatenate([np.zeros(0, np.int64), *(one.inside for one in frames)])
+    empty = int((inside == 0).sum())
+    if empty > len(inside) / 2:
+        remedy = "check that labels, calibration and clouds belong together, and the axes of the boxes."
+        yield Finding("no point", True, f"{empty} of {len(inside)} boxes hold no point; {remedy}")
+    usual = float(np.median([one.points for one in frames] or [0]))
+    for one in frames:
+        if 0 < one.points < _SPARSE * usual:
+            text = f"Frame {one.frame.name}: {one.points} points where {usual:.0f} are usual; check its cloud."
             yield Finding("few points", False, text)
     for what, option, capacity, amounts in (
-        ("points", "data.max_points", config.data.max_points, [frame.points for frame in frames]),
-        ("objects", "data.max_boxes", config.data.max_boxes, [len(frame.objects) for frame in frames]),
-        ("occupied voxels", "grid.max_voxels", config.grid.max_voxels, [frame.voxels for frame in frames]),
+        ("points", "data.max_points", config.data.max_points, [one.points for one in frames]),
+        ("objects", "data.max_boxes", config.data.max_boxes, [len(one.inside) for one in frames]),
+        ("occupied voxels", "grid.max_voxels", config.grid.max_voxels, [one.voxels for one in frames]),
     ):
-        above = sum(amount > capacity for amount in amounts)
-        if above:
-            text = (
-                f"{above} of {len(amounts)} frames have more than {capacity} {what}, up to {max(amounts)}; the rest is "
-                f"cut and counted, so raise {option} to keep it."
-            )
-            yield Finding("capacity", False, text)
+        if above := sum(amount > capacity for amount in amounts):
+            text = f"{above} of {len(amounts)} frames have more than {capacity} {what}, up to {max(amounts)}"
+            yield Finding("capacity", False, f"{text}; the rest is cut and counted, so raise {option} to keep it.")
 
 
-def _summarise(frames: Sequence[CheckedFrame], grid: GridConfig) -> dict[str, TypeSummary]:
-    """Objects by type, the most frequent first."""
-    types = np.array([labelled.type for frame in frames for labelled in frame.objects], np.str_)
-    boxes = np.array([labelled.box for frame in frames for labelled in frame.objects]).reshape(-1, 7)
-    inside = np.array([count for frame in frames for count in frame.inside.tolist()])
-    center = boxes[:, :3]
-    outside = ((center < np.array(grid.minimum)) | (center > np.array(grid.maximum))).sum(-1) > 0
-    summaries = {}
-    for name in dict.fromkeys(types.tolist()):
-        mine = types == name
-        length, width, height = np.median(boxes[mine, 3:6], axis=0).tolist()
-        summaries[name] = TypeSummary(
-            objects=int(mine.sum()),
-            out_of_range=int(outside[mine].sum()),
-            without_points=int((inside[mine] == 0).sum()),
-            size=(length, width, height),
-            center_z=float(np.median(boxes[mine, 2])),
-        )
-    return dict(sorted(summaries.items(), key=lambda item: -item[1].objects))
+def _score_labels(frames: Sequence[Frame]) -> list[LabelScore]:
+    """Score the labels as detections of score 1, for every class and metric that can be evaluated."""
+    pairs = [_as_detections(frame) for frame in frames]
+    found = evaluate([truth for truth, _ in pairs], [detections for _, detections in pairs])
+    scores = []
+    for name, (limit, _) in LIMITS.items():
+        for metric in METRICS:
+            curves, score = found.curves[name, metric, limit], found.precision(name, metric, limit)
+            if curves is not None and score is not None:
+                objects = tuple(curve.num_truths for curve in curves)
+                scores.append(LabelScore(name, metric, objects, tuple(score), tuple(map(possible_precision, objects))))
+    return scores
+
+
+def _as_detections(frame: Frame) -> tuple[LabelledObjects, DetectedObjects]:
+    """Return the labels and the same as detections; with a camera, through the LiDAR frame and back."""
+    if frame.camera is None:
+        labels = LabelledObjects(frame.names, frame.difficulty, frame.boxes)
+        return labels, DetectedObjects(frame.names, np.ones(len(frame.names)), frame.boxes)
+    pairs, fields = _projected(frame), ("location", "dimensions", "rotation_y")
+    found = [row._replace(score=1.0, **{name: getattr(seen or row, name) for name in fields}) for row, seen in pairs]
+    return labels_from_rows([row for row, _ in pairs]), detections_from_rows(found)
+
+
+def _check_scores(scores: Sequence[LabelScore]) -> Iterator[Finding]:
+    for one in scores:
+        if one.score != one.possible:
+            score, possible = (", ".join(f"{value:.2f}" for value in values) for values in (one.score, one.possible))
+            text = f"{one.name} {one.metric}: labels as detections score {score} where {possible} is possible"
+            yield Finding("score", True, f"{text}; look for labels that cover each other.")

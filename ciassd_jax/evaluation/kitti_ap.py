@@ -1,7 +1,7 @@
-"""Average precision by KITTI's official rules, in float64 NumPy (SPEC section 11.2).
+"""Average precision by KITTI's official rules, in float64 NumPy.
 
-Objects that a level of difficulty does not admit, and neighbour classes, are neutral: they take a detection, and
-neither is counted. So are detections too low for the level, whatever their class.
+Objects that a level of difficulty does not admit and objects of neighbour classes are neutral: one that is matched to a
+detection makes neither a hit nor a false positive. Detections too low for the level are neutral too, in any class.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from ciassd_jax.evaluation.matching import Candidates, assign, order_candidates, pick_thresholds
+from ciassd_jax.evaluation.matching import Pairs, assign, order_pairs, pick_thresholds
 from ciassd_jax.evaluation.objects import DetectedObjects, FlatObjects, LabelledObjects, flatten, select
 from ciassd_jax.evaluation.overlap import Geometry, Intersections, intersect
 from ciassd_jax.formats.kitti_rows import DIFFICULTIES
@@ -20,22 +20,23 @@ from ciassd_jax.formats.kitti_rows import DIFFICULTIES
 Metric = Literal["bbox", "bev", "3d", "aos"]
 Recall = Literal["R11", "R40"]
 METRICS: tuple[Metric, ...] = ("bbox", "bev", "3d", "aos")
-# The official and the loose limit of overlap; in the image the official one alone.
+# The official and the loose limit of overlap; in the image only the official one is used.
 LIMITS = {"Car": (0.7, 0.5), "Pedestrian": (0.5, 0.25), "Cyclist": (0.5, 0.25)}
 _NEIGHBOURS = {"Car": "van", "Pedestrian": "person_sitting", "Cyclist": ""}
 _NO_ALPHA = -10.0
-# Places in the curve: recall 1/40 to 1 (R40), and 0, 1/10 to 1 of the same curve (R11).
-_RECALL_PLACES: dict[Recall, slice] = {"R40": slice(1, 41), "R11": slice(0, 41, 4)}
+# Points of a precision-recall curve, at recall 0, 1/40 to 1. With fewer objects the last ones stay 0.
+CURVE_POINTS = 41
+# R40 uses recall 1/40 to 1, R11 recall 0, 1/10 to 1 of the same curve.
+_RECALL_POINTS: dict[Recall, slice] = {"R40": slice(1, None), "R11": slice(0, None, 4)}
 
 
 class Curve(NamedTuple):
-    """What happens at the T thresholds of one class, geometry, limit and difficulty.
+    """The counts at the T score thresholds of one class, geometry, limit and difficulty, and the resulting curves.
 
-    `true`, `false` and `missed` count hits, false positives and objects without a detection; an object whose
-    detection is neutral is none of them, yet one of `num_truths`. `similarity` is the sum of the orientation
-    scores (1 + cos(difference of alpha)) / 2 of the hits. `precision` and `orientation` are the 41 points after the
-    running maximum, 0 past the last threshold. Where a threshold finds neither hit nor false positive they are NaN;
-    without a camera so is all that is about orientation.
+    `true`, `false` and `missed` count hits, false positives and objects without a detection; `num_truths` also counts
+    objects whose detection is neutral. `similarity` is the sum over the hits of (1 + cos(difference of alpha)) / 2.
+    `precision` and `orientation` are the CURVE_POINTS points after the running maximum, 0 past the last threshold and
+    NaN at a threshold with neither hits nor false positives. Without a camera, `similarity` and `orientation` are NaN.
     """
 
     num_truths: int
@@ -49,7 +50,7 @@ class Curve(NamedTuple):
 
 
 class Evaluand(NamedTuple):
-    """A set made ready: its objects in flat arrays, and what each label and each DontCare area shares with them."""
+    """A data set prepared for evaluation: its objects, and their intersections with labels and DontCare areas."""
 
     truths: FlatObjects
     detections: FlatObjects
@@ -58,12 +59,12 @@ class Evaluand(NamedTuple):
 
     @property
     def has_camera(self) -> bool:
-        """Whether the objects have image boxes; without labels nothing says that they have not."""
+        """Whether the objects have image boxes; true if there are no labels."""
         return bool(np.isfinite(self.truths.image_boxes).all())
 
 
 class Within(NamedTuple):
-    """The objects that a row of a breakdown is about: other labels are neutral, other detections never false."""
+    """The objects in one part of a breakdown: other labels are neutral, other detections are not false positives."""
 
     truths: Bool[np.ndarray, " G"]
     detections: Bool[np.ndarray, " D"]
@@ -72,7 +73,7 @@ class Within(NamedTuple):
 def prepare(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObjects]) -> Evaluand:
     """Join frames and intersect their objects.
 
-    Raises ValueError for lists of different length, and where only one of them has a camera.
+    Raises ValueError for lists of different length, and if only one of them has a camera.
     """
     if len(truths) != len(detections):
         raise ValueError(f"{len(truths)} frames of labels, {len(detections)} of detections; give one for each.")
@@ -85,10 +86,10 @@ def prepare(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObje
 
 
 def is_evaluated(detections: FlatObjects, name: str, metric: Metric) -> bool:
-    """Whether the official program evaluates a class at all: some detection of it must have what the metric needs.
+    """Return whether the official program evaluates a class: a detection of it must have what the metric needs.
 
-    In the image that is a left edge that is not negative, in the plane and in space a place there and a positive
-    size. Orientation needs the image, and is off for all classes where any detection gives no alpha (-10).
+    In the image that is a non-negative left edge, in BEV and in 3D a location and a positive size. Orientation needs
+    the image too, and is disabled for all classes if any detection has no alpha (-10).
     """
     found = select(detections, detections.types == name.lower())
     center, size = found.boxes.center, found.boxes.size
@@ -104,25 +105,26 @@ def is_evaluated(detections: FlatObjects, name: str, metric: Metric) -> bool:
 def trace_curve(
     evaluand: Evaluand, name: str, geometry: Geometry, limit: float, level: int, within: Within | None = None
 ) -> Curve:
-    """The curve of a class at one limit of overlap and one level, an index of DIFFICULTIES; overlap must exceed it.
+    """Return the curve of a class at a limit that the overlap must exceed and a level, an index of DIFFICULTIES.
 
-    A first pass without thresholds gives each object its best score, and the hits' scores give the thresholds; at
-    each of them the second gives it the best overlap, and the first neutral detection only where there is no valid.
+    A first pass matches each object to the detection of highest score, and the scores of the hits give the thresholds.
+    The second pass matches at each threshold by largest overlap, and uses neutral detections only for objects without
+    a valid one.
     """
     case = _state_case(evaluand, name, geometry, limit, level, within)
     every = np.array([-np.inf])
     best_scored = _match(case, every, -case.score[case.second])
     num_truths = int(case.valid_truths.sum())
-    hit_scores = case.score[best_scored.candidates.detection[best_scored.hits[0]]]
+    hit_scores = case.score[best_scored.pairs.detection[best_scored.hits[0]]]
     thresholds = pick_thresholds(hit_scores, num_truths)
 
-    # Neutral ones come last, in the order of rows.
+    # Neutral detections come last, in the order of rows.
     cost = np.where(case.valid_detections[case.second], -case.overlap, 0)
     match = _match(case, thresholds, cost)
     true = match.hits.sum(1)
     countable = np.flatnonzero(case.countable)
     false = ((case.score[countable] >= thresholds[:, None]) & ~match.taken[:, countable]).sum(1)
-    turn = evaluand.truths.alpha[match.candidates.truth] - evaluand.detections.alpha[match.candidates.detection]
+    turn = evaluand.truths.alpha[match.pairs.truth] - evaluand.detections.alpha[match.pairs.detection]
     similarity = np.where(match.hits, (1 + np.cos(turn)) / 2, 0).sum(1)
     precision, orientation = (_envelope(value, true + false) for value in (true, similarity))
     missed = num_truths - match.found.sum(1)
@@ -132,20 +134,26 @@ def trace_curve(
 def trace_levels(
     evaluand: Evaluand, name: str, geometry: Geometry, limit: float, within: Within | None = None
 ) -> tuple[Curve, ...]:
-    """The curves of all levels of difficulty."""
+    """Return the curves of all levels of difficulty."""
     levels = range(len(DIFFICULTIES))
     return tuple(trace_curve(evaluand, name, geometry, limit, level, within) for level in levels)
 
 
 def average_precision(curve: Float64[np.ndarray, " 41"], recall: Recall = "R40") -> float:
-    """Mean of a Curve's `precision` or `orientation`, in percent, over the recalls 1/40 to 1 or 0, 1/10 to 1."""
-    return 100 * float(curve[_RECALL_PLACES[recall]].mean())
+    """Return the mean of a Curve's `precision` or `orientation` in percent, over the recalls of R40 or R11."""
+    return 100 * float(curve[_RECALL_POINTS[recall]].mean())
+
+
+def possible_precision(num_truths: int) -> float:
+    """Return the AP R40 of this number of objects if all are found with one score and nothing else is."""
+    thresholds = pick_thresholds(np.ones(num_truths), num_truths)
+    return average_precision(np.where(np.arange(CURVE_POINTS) < len(thresholds), 1.0, 0.0))
 
 
 class _Case(NamedTuple):
-    """Who counts in one curve, and the E pairs of labels and detections that may match.
+    """The objects that count in one curve, and the E pairs of labels and detections that may match.
 
-    What is not valid among the pairs is neutral. `countable` detections are false where nothing takes them.
+    Objects of a pair that are not valid are neutral. `countable` detections are false positives if unmatched.
     """
 
     valid_truths: Bool[np.ndarray, " G"]
@@ -159,9 +167,9 @@ class _Case(NamedTuple):
 
 
 class _Match(NamedTuple):
-    """At each threshold the pairs of valid objects, those of them that are hits, and the detections taken."""
+    """At each threshold the matched pairs of valid labels, those that are hits, and the matched detections."""
 
-    candidates: Candidates
+    pairs: Pairs
     found: Bool[np.ndarray, "T E"]
     hits: Bool[np.ndarray, "T E"]
     taken: Bool[np.ndarray, "T D"]
@@ -174,7 +182,7 @@ def _state_case(
     same = truths.types == name.lower()
     valid_truths = same & (truths.difficulty >= 0) & (truths.difficulty <= level)
     height = np.abs(detections.image_boxes[:, 3] - detections.image_boxes[:, 1])
-    # The height comes before the class, and without a camera no detection is too low: NaN compares false.
+    # Height is tested before the class. Without a camera no detection is too low, as comparisons with NaN are false.
     low = height < DIFFICULTIES[level].min_height
     of_class = detections.types == name.lower()
     areas = evaluand.dont_care[geometry]
@@ -200,16 +208,16 @@ def _state_case(
 
 
 def _match(case: _Case, thresholds: Float64[np.ndarray, " T"], cost: Float64[np.ndarray, " E"]) -> _Match:
-    candidates = order_candidates(case.first, case.second, case.frame, cost)
-    visible = case.score[candidates.detection] >= thresholds[:, None]
-    chosen, taken = assign(candidates, visible, len(case.score))
-    found = chosen & case.valid_truths[candidates.truth]
-    return _Match(candidates, found, found & case.valid_detections[candidates.detection], taken)
+    pairs = order_pairs(case.first, case.second, case.frame, cost)
+    visible = case.score[pairs.detection] >= thresholds[:, None]
+    chosen, taken = assign(pairs, visible, len(case.score))
+    found = chosen & case.valid_truths[pairs.truth]
+    return _Match(pairs, found, found & case.valid_detections[pairs.detection], taken)
 
 
 def _envelope(value: np.ndarray, total: Int[np.ndarray, " T"]) -> Float64[np.ndarray, " 41"]:
-    """41 points of value / total, each the maximum from there on; NaN stays where it stands, as in the devkit."""
-    curve = np.zeros(41)
+    """Return value / total as CURVE_POINTS points, each the maximum from there on; NaN stays, as in the devkit."""
+    curve = np.zeros(CURVE_POINTS)
     np.divide(value, total, out=curve[: len(total)], where=total > 0)
     curve[: len(total)][total == 0] = np.nan
     return np.where(np.isnan(curve), np.nan, np.fmax.accumulate(curve[::-1])[::-1])

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 
-class Candidates(NamedTuple):
-    """E pairs that may be matched, in the order in which they are tried.
+class Pairs(NamedTuple):
+    """E pairs of objects that may be matched, in the order in which they are tried.
 
-    An object chooses after all of its frame that come before it in the file, and takes its first pair whose
-    detection is still there. `start` is where each object's pairs begin, `round` where each round of objects of
-    different frames begins in `start`; both end with the end.
+    Objects of a frame choose in the order of the file, each the first of its pairs whose detection is still free.
+    `start` is where each object's pairs begin, `round` where each round of one object per frame begins in `start`;
+    both also hold their end.
     """
 
     truth: Int[np.ndarray, " E"]
@@ -22,15 +22,15 @@ class Candidates(NamedTuple):
     round: Int[np.ndarray, " R"]
 
 
-def order_candidates(
+def order_pairs(
     truth: Int[np.ndarray, " E"],
     detection: Int[np.ndarray, " E"],
     frame: Int[np.ndarray, " E"],
     cost: Float64[np.ndarray, " E"],
-) -> Candidates:
-    """Sort pairs for `assign`: by round, object and ascending `cost`; pairs of equal cost keep their order.
+) -> Pairs:
+    """Sort pairs for `assign` by round, object and ascending `cost`; pairs of equal cost keep their order.
 
-    `frame` is that of each pair and does not descend, nor does `truth`.
+    `frame` is that of each pair; `frame` and `truth` are ascending.
     """
     objects, first, owner = np.unique(truth, return_index=True, return_inverse=True)
     frames = frame[first]
@@ -39,36 +39,36 @@ def order_candidates(
     sorted_truth = truth[order]
     start = np.flatnonzero(np.diff(sorted_truth, prepend=-1))
     rounds = np.searchsorted(np.sort(place), np.arange(place.max(initial=-1) + 2))
-    return Candidates(sorted_truth, detection[order], np.append(start, len(order)), rounds)
+    return Pairs(sorted_truth, detection[order], np.append(start, len(order)), rounds)
 
 
 def assign(
-    candidates: Candidates, visible: Bool[np.ndarray, "T E"], num_detections: int
+    pairs: Pairs, visible: Bool[np.ndarray, "T E"], num_detections: int
 ) -> tuple[Bool[np.ndarray, "T E"], Bool[np.ndarray, "T D"]]:
-    """Match at T thresholds at once; returns the chosen pairs and the detections that are taken.
+    """Match at T thresholds at once; returns the chosen pairs and the matched detections.
 
-    Rounds follow one another, but in one round no two objects want the same detection, so that all frames and
-    thresholds choose together: exactly the loop over frames and objects.
+    Rounds run one after the other. Within a round no two objects compete for a detection, so that all frames and
+    thresholds are matched together, with the result of the loop over frames and objects.
     """
     chosen = np.zeros(visible.shape, bool)
     taken = np.zeros((len(visible), num_detections), bool)
-    for begin, end in zip(candidates.round[:-1], candidates.round[1:], strict=True):
-        start = candidates.start[begin:end]
-        pairs = slice(start[0], candidates.start[end])
-        free = visible[:, pairs] & ~taken[:, candidates.detection[pairs]]
-        place = np.where(free, np.arange(pairs.start, pairs.stop), pairs.stop)
+    for begin, end in zip(pairs.round[:-1], pairs.round[1:], strict=True):
+        start = pairs.start[begin:end]
+        tried = slice(start[0], pairs.start[end])
+        free = visible[:, tried] & ~taken[:, pairs.detection[tried]]
+        place = np.where(free, np.arange(tried.start, tried.stop), tried.stop)
         best = np.minimum.reduceat(place, start - start[0], axis=1)
-        threshold, owner = np.nonzero(best < pairs.stop)
+        threshold, owner = np.nonzero(best < tried.stop)
         pair = best[threshold, owner]
         chosen[threshold, pair] = True
-        taken[threshold, candidates.detection[pair]] = True
+        taken[threshold, pairs.detection[pair]] = True
     return chosen, taken
 
 
 def pick_thresholds(scores: Float64[np.ndarray, " hits"], num_truths: int) -> Float64[np.ndarray, " T"]:
-    """The scores, descending, at which recall comes closest to 0, 1/40, 2/40, ... of `num_truths` objects.
+    """Return the scores, descending, at which recall is closest to 0, 1/40, 2/40, ... of `num_truths` objects.
 
-    The sum of fortieths is accumulated: exact ties occur, and its rounding decides them.
+    As in the devkit the fortieths are accumulated, because their rounding decides exact ties.
     """
     ordered = np.sort(scores)[::-1]
     picked, recall = [], 0.0

@@ -1,26 +1,29 @@
-"""What evaluation compares: the labelled and the detected objects of a frame, and of a whole set in flat arrays."""
+"""The labelled and detected objects that evaluation compares: per frame, and of a data set in flat arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float64, Int
 
-from ciassd_jax.formats.kitti_rows import ObjectRow, difficulty_of
+from ciassd_jax.data.frames import Frame
+from ciassd_jax.formats.errors import InputError
+from ciassd_jax.formats.kitti_rows import DONT_CARE, ObjectRow, difficulty_of
+from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.types import Boxes
 
-# What KITTI writes for a location that is not given.
+# KITTI's value for a location that is not given.
 _NO_LOCATION = -1000.0
 
 
 class LabelledObjects(NamedTuple):
     """The labels of one frame, G objects in the order of their file, in float64.
 
-    `difficulty` is an index in formats.kitti_difficulty.DIFFICULTIES or -1. `boxes` are in any right-handed frame
-    with z up whose origin is the sensor. `image_boxes` (x1, y1, x2, y2) in pixels and `alpha` in radians are None for
-    data without a camera; `points`, the number of points in each box, is None where it is not known.
+    `difficulty` is an index in formats.kitti_rows.DIFFICULTIES or -1. `boxes` are in any right-handed frame with z up
+    whose origin is the sensor. `image_boxes` (x1, y1, x2, y2) in pixels and `alpha` in radians are None for data
+    without a camera; `points`, the number of points in each box, is None if unknown.
     """
 
     types: tuple[str, ...]
@@ -32,9 +35,9 @@ class LabelledObjects(NamedTuple):
 
 
 class DetectedObjects(NamedTuple):
-    """The detections of one frame, D objects; the fields of LabelledObjects, and finite scores.
+    """The detections of one frame, D objects, with the fields of LabelledObjects and finite scores.
 
-    NaN stands where a result gives no place in the plane (center x) or no height (center z).
+    A coordinate of `boxes.center` that the result does not give is NaN.
     """
 
     types: tuple[str, ...]
@@ -46,10 +49,10 @@ class DetectedObjects(NamedTuple):
 
 
 class FlatObjects(NamedTuple):
-    """The objects of N frames in one array per field, frame after frame; `types` in lower case.
+    """The objects of several frames in one array per field, frame after frame; `types` are in lower case.
 
-    Labels have `difficulty` and NaN scores, detections scores and difficulty -1. Without a camera the image boxes
-    and alphas are NaN; without points `points` is -1.
+    Labels have score NaN, detections difficulty -1. Without a camera, image boxes and alphas are NaN; unknown `points`
+    are -1.
     """
 
     frame: Int[np.ndarray, " O"]
@@ -62,14 +65,31 @@ class FlatObjects(NamedTuple):
     points: Int[np.ndarray, " O"]
 
 
+def labels_from_frame(frame: Frame) -> LabelledObjects:
+    """Return the labels of a frame, with the number of points in each box.
+
+    With a camera they are the rows of the label file, DontCare among them, without one the boxes of the frame. Raises
+    InputError for a frame without labels.
+    """
+    inside = np.asarray(points_in_boxes(frame.points, frame.boxes)).sum(-1)
+    if frame.camera is None:
+        return LabelledObjects(frame.names, frame.difficulty, frame.boxes, points=inside)
+    if frame.rows is None:
+        raise InputError(f"Frame {frame.name} has no labels to compare with; choose a split of labelled frames.")
+    rows = cast(tuple[ObjectRow, ...], frame.rows)
+    points = np.zeros(len(rows), np.int64)
+    points[[row.type != DONT_CARE for row in rows]] = inside
+    return labels_from_rows(rows)._replace(points=points)
+
+
 def labels_from_rows(rows: Sequence[ObjectRow]) -> LabelledObjects:
-    """The objects of a label file, DontCare areas among them; boxes in axes right, forward, up from the camera."""
+    """Return the objects of a label file, DontCare among them; boxes in axes right, forward, up from the camera."""
     difficulty = np.array([difficulty_of(row) for row in rows], np.int64)
     return LabelledObjects(tuple(row.type for row in rows), difficulty, *_geometry(rows))
 
 
 def detections_from_rows(rows: Sequence[ObjectRow]) -> DetectedObjects:
-    """The objects of a result file, whose rows all have a score; boxes as in `labels_from_rows`."""
+    """Return the objects of a result file, whose rows all have a score; boxes as in `labels_from_rows`."""
     score = np.array([row.score for row in rows], np.float64)
     return DetectedObjects(tuple(row.type for row in rows), score, *_geometry(rows))
 
@@ -92,7 +112,7 @@ def flatten(frames: Sequence[LabelledObjects] | Sequence[DetectedObjects]) -> Fl
 
 
 def select(objects: FlatObjects, index: np.ndarray) -> FlatObjects:
-    """The objects at an index or mask."""
+    """Return the objects at an index or mask."""
     boxes = Boxes(*(leaf[index] for leaf in objects.boxes))
     return FlatObjects._make(boxes if field is objects.boxes else field[index] for field in objects)
 
@@ -113,7 +133,7 @@ def _geometry(
 def _join(
     field: str, frames: Sequence[LabelledObjects] | Sequence[DetectedObjects], sizes: list[int], missing: np.ndarray
 ) -> np.ndarray:
-    """One field of all frames, or `missing` for every object where no frame has it."""
+    """Join one field of all frames; `missing` stands for each object if no frame has the field."""
     parts = [getattr(frame, field) for frame in frames]
     lacking = [part is None for part in parts]
     if any(lacking) and not all(lacking):

@@ -11,15 +11,15 @@ from ciassd_jax.evaluation.objects import FlatObjects
 from ciassd_jax.ops.iou import intersection_bev
 from ciassd_jax.types import Boxes
 
-# Overlap of image boxes, of footprints, of volumes.
+# Image boxes, footprints, volumes.
 Geometry = Literal["bbox", "bev", "3d"]
 
 
 class Intersections(NamedTuple):
-    """E pairs of objects of one frame that share some area or volume, by ascending `first`, then `second`.
+    """E pairs of intersecting objects of the same frame, sorted by `first`, then `second`.
 
-    `shared` is theirs, `first_size` and `second_size` that of each object: square pixels, square metres or cubic
-    metres.
+    `shared` is the area or volume of the intersection, `first_size` and `second_size` that of each object, in square
+    pixels, square metres or cubic metres.
     """
 
     first: Int[np.ndarray, " E"]
@@ -35,12 +35,12 @@ class Intersections(NamedTuple):
 
     @property
     def coverage(self) -> Float64[np.ndarray, " E"]:
-        """The part of the second object that the first covers."""
+        """The fraction of the second object that the first covers."""
         return self.shared / self.second_size
 
 
 def intersect(a: FlatObjects, b: FlatObjects) -> dict[Geometry, Intersections]:
-    """What objects of `a` and `b` share; as the official rules have it, a box of negative height shares no volume."""
+    """Return the intersections of objects of `a` and `b`; by the official rules a negative height has no volume."""
     first, second = _pairs(a.frame, b.frame)
     image = _image_intersections(a.image_boxes, b.image_boxes, first, second)
     near = _near(a.boxes, b.boxes, first, second)
@@ -60,7 +60,7 @@ def intersect(a: FlatObjects, b: FlatObjects) -> dict[Geometry, Intersections]:
 def _pairs(
     frame: Int[np.ndarray, " A"], other: Int[np.ndarray, " B"]
 ) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
-    """All pairs of objects of the same frame; both lists of frames ascend."""
+    """Return all pairs of objects of the same frame; both lists of frames are ascending."""
     start, stop = np.searchsorted(other, frame, "left"), np.searchsorted(other, frame, "right")
     count = stop - start
     first = np.repeat(np.arange(len(frame)), count)
@@ -76,14 +76,14 @@ def _image_intersections(
 ) -> Intersections:
     low = np.maximum(a[first, :2], b[second, :2])
     high = np.minimum(a[first, 2:], b[second, 2:])
-    # Comparisons with NaN are false: without a camera nothing is shared.
+    # Comparisons with NaN are false, so that nothing intersects without a camera.
     shared = np.where((high > low).all(1), (high - low).prod(1), 0)
     area, other_area = ((boxes[:, 2:] - boxes[:, :2]).prod(1) for boxes in (a, b))
     return _shared_only(first, second, shared, area[first], other_area[second])
 
 
 def _near(a: Boxes, b: Boxes, first: Int[np.ndarray, " E"], second: Int[np.ndarray, " E"]) -> Int[np.ndarray, " near"]:
-    """Pairs whose circumscribed circles meet; no others can share anything."""
+    """Return the pairs whose circumscribed circles meet; no others can intersect."""
     distance = np.hypot(*(a.center[first, :2] - b.center[second, :2]).T)
     radius, other_radius = (np.hypot(*boxes.size[:, :2].T) / 2 for boxes in (a, b))
     return np.flatnonzero(distance <= radius[first] + other_radius[second])

@@ -1,4 +1,4 @@
-"""An evaluation as text and as JSON: the block that the field's scripts parse, and tables for the eye."""
+"""An evaluation as text and as JSON: the block that other toolboxes print, and tables."""
 
 from __future__ import annotations
 
@@ -7,24 +7,22 @@ import math
 from collections.abc import Iterable
 
 from ciassd_jax.evaluation.breakdown import Row
-from ciassd_jax.evaluation.kitti_ap import LIMITS, METRICS, Metric, Recall, average_precision
+from ciassd_jax.evaluation.kitti_ap import CURVE_POINTS, LIMITS, METRICS, Metric, Recall, average_precision
 from ciassd_jax.evaluation.summary import Evaluation
 from ciassd_jax.formats.kitti_rows import DIFFICULTIES
 
-# By class, metric, R11 or R40, and limit of overlap.
+# Keys are class, metric, R11 or R40, and limit of overlap.
 Precisions = dict[str, dict[str, dict[str, dict[str, list[float | None] | None]]]]
 
 _RECALLS: tuple[Recall, ...] = ("R11", "R40")
-# Fewer objects leave points of the curve at zero, whatever the detector does.
-_ENOUGH_OBJECTS = 41
 _LEVELS = "".join(f"{level.name:>10}" for level in DIFFICULTIES)
 
 
 def to_json(evaluation: Evaluation) -> Precisions:
-    """AP in percent as {"Car": {"3d": {"R40": {"0.70": [easy, moderate, hard]}}}}.
+    """Return AP in percent as {"Car": {"3d": {"R40": {"0.70": [easy, moderate, hard]}}}}.
 
-    Every class, metric (bbox, bev, 3d, aos), R11 and R40 and limit of overlap is there: None where the official
-    program evaluates nothing, None in a list where its value is not a number.
+    The keys are all classes, metrics (bbox, bev, 3d, aos), R11 and R40, and limits of overlap. The value is None if
+    the official program does not evaluate it; None in a list stands for NaN.
     """
     result: Precisions = {}
     for name, metric, limit in evaluation.curves:
@@ -37,7 +35,7 @@ def to_json(evaluation: Evaluation) -> Precisions:
 
 
 def format_block(evaluation: Evaluation) -> str:
-    """The block that other toolboxes print and scripts parse; a class without detections has none in it."""
+    """Return the block that other toolboxes print and scripts parse, without classes that have no detections."""
     lines = []
     for name, limits in LIMITS.items():
         if all(evaluation.curves[name, metric, limits[0]] is None for metric in METRICS):
@@ -51,17 +49,17 @@ def format_block(evaluation: Evaluation) -> str:
 
 
 def format_report(evaluation: Evaluation) -> str:
-    """The official program's block and our tables."""
+    """Return `format_block` and `format_tables`."""
     return f"{format_block(evaluation)}\n\n{format_tables(evaluation)}".strip()
 
 
 def format_json(evaluation: Evaluation) -> str:
-    """`to_json` as text."""
+    """Return `to_json` as text."""
     return json.dumps(to_json(evaluation), indent=1, allow_nan=False)
 
 
 def format_tables(evaluation: Evaluation) -> str:
-    """Tables of AP, of the parts by distance and by points, of the correlation, and what to know of them."""
+    """Return tables of AP, in total, by distance and by number of points, with the correlation and notes."""
     parts = [_main_table(evaluation)]
     for title, rows in (("distance", evaluation.by_distance), ("number of points", evaluation.by_points)):
         if rows:
@@ -80,7 +78,7 @@ def _block_lines(evaluation: Evaluation, name: str, limit: float, recall: Recall
     official = LIMITS[name][0]
     for metric in METRICS:
         values = evaluation.precision(name, metric, limit if metric in ("bev", "3d") else official, recall)
-        # The field's programs leave out orientation where it is off, and only that.
+        # Other toolboxes omit orientation if it is disabled, but no other metric.
         if values is not None or metric != "aos":
             shown = ", ".join(f"{value:.4f}" for value in values or [math.nan] * len(DIFFICULTIES))
             yield f"{metric:<4} AP:{shown}"
@@ -105,7 +103,7 @@ def _main_line(evaluation: Evaluation, name: str, metric: Metric, limit: float) 
 
 
 def _part_line(row: Row) -> str:
-    # A part without objects has no AP rather than one of 0.
+    # Without objects there is no AP, rather than one of 0.
     values = [average_precision(curve.precision) if curve.num_truths else math.nan for curve in row.curves]
     counts = "".join(f"{curve.num_truths:>10}" for curve in row.curves)
     return f"{row.name:<12}{row.geometry:<8}{row.part:>14}{_columns(values)}{'':10}{counts}"
@@ -125,15 +123,15 @@ def _notes(evaluation: Evaluation) -> Iterable[str]:
         yield "Orientation (aos) is not evaluated, as a detection has alpha -10 or none is in the image."
     if not evaluation.by_points:
         yield "Nothing by number of points, as the points in the boxes are not known here."
-    if min(_counts(evaluation), default=_ENOUGH_OBJECTS) < _ENOUGH_OBJECTS:
+    if min(_counts(evaluation), default=CURVE_POINTS) < CURVE_POINTS:
         yield (
-            f"By the official rule n objects fill n points of the curve, so that fewer than {_ENOUGH_OBJECTS} cannot "
+            f"By the official rule n objects fill n points of the curve, so that fewer than {CURVE_POINTS} cannot "
             "reach 100 by R40."
         )
 
 
 def _counts(evaluation: Evaluation) -> Iterable[int]:
-    """Numbers of objects behind all that the tables show."""
+    """Return the numbers of objects behind each number of the tables."""
     shown = [curves for curves in evaluation.curves.values() if curves is not None]
     shown += [row.curves for row in evaluation.by_distance + evaluation.by_points]
     return (curve.num_truths for curves in shown for curve in curves)

@@ -1,4 +1,4 @@
-"""Folders of label and result files as KITTI's devkit has them: NNNNNN.txt, one per frame."""
+"""Folders of label and result files in the layout of KITTI's devkit: NNNNNN.txt, one per frame."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, dete
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike
 from ciassd_jax.formats.kitti_rows import read_results, read_rows
 
-# Fields of ResultFile, and what is done with their lines.
+# Fields of ResultFile, and how their lines are evaluated.
 _ODD_ROWS = {
     "short": "Rows of fewer than 16 columns were left out",
-    "long": "Of rows of more than 16 columns the surplus was skipped",
+    "long": "The surplus of rows of more than 16 columns was ignored",
     "repeated": "Rows that repeat another of their file count again, as false positives",
 }
 
 
 def read_folders(labels: Pathlike, results: Pathlike) -> tuple[list[LabelledObjects], list[DetectedObjects]]:
-    """Read every frame that has a result file, in the order of names.
+    """Read all frames that have a result file, in the order of their names.
 
-    As the official program does, frames without one are not evaluated, rows of fewer than 16 columns are dropped,
-    surplus columns skipped, and a repeated row counts again, as a false positive: a FormatWarning counts each and
-    names the first. Raises InputError, one sentence with the remedy, for a folder that is missing or has no .txt
-    files, for results of frames without labels, and for what `read_rows` and `read_results` refuse.
+    As in the official program, frames without a result file are not evaluated, rows of fewer than 16 columns are
+    dropped, surplus columns are ignored, and a repeated row counts again, as a false positive. A FormatWarning tells
+    the number of each and names the first. Raises InputError, one sentence with the remedy, for a folder that is
+    missing or has no .txt files, for results of frames without labels, and as `read_rows` and `read_results`.
     """
     label_files = _text_files(labels, "labels")
     result_files = _text_files(results, "results")
@@ -49,7 +49,7 @@ def read_folders(labels: Pathlike, results: Pathlike) -> tuple[list[LabelledObje
 
 
 def _text_files(folder: Pathlike, what: str) -> dict[str, Path]:
-    """The .txt files of a folder by name, in order."""
+    """Return the .txt files of a folder by name, in order."""
     path = Path(folder)
     if not path.is_dir():
         state = "is a file" if path.exists() else "does not exist"

@@ -1,4 +1,4 @@
-"""The whole evaluation of a set in one call."""
+"""The evaluation of a data set in one call."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects
 
 
 class Evaluation(NamedTuple):
-    """What `evaluate` finds.
+    """The result of `evaluate`.
 
-    `curves` holds the easy, moderate and hard curve for every class, metric and limit, or None where the official
-    program evaluates nothing; those of aos are those of bbox, whose `orientation` counts. `by_points` is empty where
-    the numbers are not known. `correlation` is that of score and 3D overlap by class, NaN where there is none.
-    Without a camera there is neither bbox nor aos, and difficulty is not KITTI's.
+    `curves` holds the easy, moderate and hard curve of every class, metric and limit, or None if the official program
+    does not evaluate it; aos has the curves of bbox, of which it uses `orientation`. `by_points` is empty if the
+    numbers of points are unknown. `correlation` is that of score and 3D overlap by class, or NaN. Without a camera
+    there is neither bbox nor aos, and difficulty is not KITTI's.
     """
 
     num_frames: int
@@ -37,7 +37,7 @@ class Evaluation(NamedTuple):
     correlation: dict[str, float]
 
     def precision(self, name: str, metric: Metric, limit: float, recall: Recall = "R40") -> list[float] | None:
-        """AP in percent, easy, moderate and hard; None where nothing is evaluated, NaN for zero over zero."""
+        """Return AP in percent, easy, moderate and hard; None if not evaluated, NaN for zero over zero."""
         curves = self.curves[name, metric, limit]
         if curves is None:
             return None
@@ -47,9 +47,9 @@ class Evaluation(NamedTuple):
 def evaluate(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObjects]) -> Evaluation:
     """Evaluate detections by KITTI's official rules; both lists hold one record per frame, in the same order.
 
-    Frames of KITTI come from `labels_from_rows` and `detections_from_rows`. Data without a camera gives records of
-    its own boxes and its own difficulty, with neither image boxes nor alpha: no detection is too low then.
-    Raises ValueError for lists that do not fit together.
+    For KITTI's files, make the records with `labels_from_rows` and `detections_from_rows`. Records of data without a
+    camera have their own boxes and difficulty, but no image boxes and alphas; no detection is too low then. Raises
+    ValueError for lists that do not match.
     """
     evaluand = prepare(truths, detections)
     curves: dict[tuple[str, Metric, float], tuple[Curve, ...] | None] = {}

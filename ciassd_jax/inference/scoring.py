@@ -11,27 +11,26 @@ from typing import NamedTuple
 import numpy as np
 
 from ciassd_jax.data.frames import Dataset, Frame
-from ciassd_jax.data.kitti import PLACES
-from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
+from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_frame
 from ciassd_jax.evaluation.summary import Evaluation, evaluate
 from ciassd_jax.formats.errors import DroppedWarning, FormatWarning, InputError, Pathlike
 from ciassd_jax.formats.kitti_camera import frustum_of
-from ciassd_jax.formats.kitti_rows import DONT_CARE, format_row, read_rows
+from ciassd_jax.formats.kitti_rows import format_row
 from ciassd_jax.formats.writing import replacing
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.types import Boxes
 
-# The weights that training leaves in its folder, the better ones first: best by validation, and of the last step.
+# Weights that training writes to its folder, in order of preference: the best by validation, and the last.
 TRAINED = ("best.safetensors", "last.safetensors")
 
 
-class ScoredFrame(NamedTuple):
-    """A frame's labels and detections as they are evaluated, and the detections as lines of a file.
+class Scored(NamedTuple):
+    """The labels and detections of a frame as they are evaluated, and the detections as lines of a file.
 
-    `lines` are rows of the data set's own layout with the score last: KITTI's with a camera (SPEC 11.1), without one
-    x, y, z, length, width, height, yaw in the LiDAR frame, and the class. All numbers have 4 decimals.
+    `lines` have the columns of the data set's labels with the score last: KITTI's with a camera; without one x, y, z,
+    length, width, height, yaw in the LiDAR frame, and the class. All numbers have 4 decimals.
     """
 
     name: str
@@ -44,25 +43,25 @@ class ScoredFrame(NamedTuple):
 def score_dataset(
     detector: Detector, dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
 ) -> Evaluation:
-    """Average precision of a detector on the frames of a data set; as `detect_dataset` and `score_frames`."""
+    """Return the average precision of a detector on a data set: `score_frames` of `detect_dataset`."""
     return score_frames(detect_dataset(detector, dataset, track))
 
 
-def score_frames(frames: Sequence[ScoredFrame]) -> Evaluation:
-    """Average precision by KITTI's rules; without a camera, difficulty is by the number of points in a box."""
+def score_frames(frames: Sequence[Scored]) -> Evaluation:
+    """Return the average precision by KITTI's rules; without a camera, difficulty is by the points in a box."""
     return evaluate([frame.truth for frame in frames], [frame.detections for frame in frames])
 
 
 def detect_dataset(
     detector: Detector, dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
-) -> list[ScoredFrame]:
-    """Detect in every frame of a data set, where there is a camera only what it sees.
+) -> list[Scored]:
+    """Detect in every frame of a data set; with a camera only in its view.
 
-    `track` sees the names go by, for a progress bar. What the frames lack (FormatWarning) and what the program had to
-    drop (DroppedWarning) is summed over all frames and warned of at the end. Raises InputError for a frame
-    that cannot be read or has no labels.
+    `track` wraps the iteration over the names, for a progress bar. One FormatWarning per kind tells what frames lack,
+    and one DroppedWarning what the program dropped, summed over all frames. Raises InputError for a frame that cannot
+    be read or has no labels.
     """
-    scored: list[ScoredFrame] = []
+    scored: list[Scored] = []
     for frame, truth in labelled_frames(dataset, track):
         with warnings.catch_warnings():
             # The counts of the results say the same.
@@ -77,18 +76,17 @@ def detect_dataset(
 def labelled_frames(
     dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
 ) -> Iterator[tuple[Frame, LabelledObjects]]:
-    """The frames of a data set, each with the labels that it is scored by; warnings and errors as `detect_dataset`."""
+    """Yield the frames of a data set with the labels to score against; warnings and errors as in `detect_dataset`."""
     lacking: dict[str, list[str]] = {}
     for index, _ in enumerate(track(dataset.names)):
-        sources = dataset.sources(index)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", FormatWarning)
             frame = dataset.read(index)
-            truth = _labels(frame, sources)
+        truth = labels_from_frame(frame)
         for one in caught:
             if issubclass(one.category, FormatWarning):
                 text = str(one.message)
-                lacking.setdefault(_kind(text, sources), []).append(text)
+                lacking.setdefault(_kind(text, dataset.sources(index)), []).append(text)
             else:
                 warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
         yield frame, truth
@@ -97,67 +95,52 @@ def labelled_frames(
         warnings.warn(first + likewise, FormatWarning, stacklevel=3)
 
 
-def describe_dropped(frames: Sequence[ScoredFrame]) -> str:
-    """A sentence on what was not used, summed over the frames; empty where nothing was lost."""
+def describe_dropped(frames: Sequence[Scored]) -> str:
+    """Return a sentence on what was dropped, summed over the frames; empty if nothing was."""
     dropped = _dropped(frames)
     return f"Dropped {'; '.join(dropped)}." if dropped else ""
 
 
-def score_frame(frame: Frame, truth: LabelledObjects, result: FrameResult) -> ScoredFrame:
-    """A frame of `labelled_frames` and its detections, made ready for evaluation."""
+def score_frame(frame: Frame, truth: LabelledObjects, result: FrameResult) -> Scored:
+    """Prepare a frame of `labelled_frames` and its detections for evaluation."""
     boxes = Boxes.from_array(result.boxes)
     inside = np.asarray(points_in_boxes(frame.points, boxes)).sum(-1)
     if frame.camera is not None:
         rows, kept = result.rows(frame.camera)
         found = detections_from_rows(rows)._replace(points=inside[kept])
-        return ScoredFrame(frame.name, truth, found, tuple(map(format_row, rows)), result)
+        return Scored(frame.name, truth, found, tuple(map(format_row, rows)), result)
     found = DetectedObjects(result.labels, result.scores.astype(np.float64), boxes, points=inside)
     lines = [
         " ".join([*(f"{value:.4f}" for value in box), label, f"{score:.4f}"])
         for box, label, score in zip(result.boxes, result.labels, result.scores, strict=True)
     ]
-    return ScoredFrame(frame.name, truth, found, tuple(lines), result)
+    return Scored(frame.name, truth, found, tuple(lines), result)
 
 
-def write_frames(frames: Sequence[ScoredFrame], folder: Pathlike) -> None:
-    """Write the lines of every frame to `folder/NAME.txt`, empty where nothing was detected; each file whole."""
+def write_frames(frames: Sequence[Scored], folder: Pathlike) -> None:
+    """Write the lines of every frame to `folder/NAME.txt`; a frame without detections gives an empty file."""
     for frame in frames:
         with replacing(Path(folder) / f"{frame.name}.txt") as path:
             path.write_text("".join(f"{line}\n" for line in frame.lines), encoding="utf-8", newline="\n")
 
 
 def find_trained(workdir: Pathlike) -> Path:
-    """The weights that training left in its folder, the best where there are some; raises InputError without any."""
+    """Return the first of TRAINED that exists in the folder of a training; raises InputError without any."""
     for name in TRAINED:
         if (Path(workdir) / name).is_file():
             return Path(workdir) / name
     raise InputError(f"{workdir} has neither {' nor '.join(TRAINED)}; name the folder of a training that saved some.")
 
 
-def _labels(frame: Frame, sources: Iterable[Path]) -> LabelledObjects:
-    """With a camera the rows of the label file as they are, DontCare among them; else the boxes of the frame."""
-    inside = np.asarray(points_in_boxes(frame.points, frame.boxes)).sum(-1)
-    if frame.camera is None:
-        return LabelledObjects(frame.names, frame.difficulty, frame.boxes, points=inside)
-    folder = Path(PLACES["label"][0]).parent.name
-    path = next((path for path in sources if path.parent.name == folder), None)
-    if path is None:
-        raise InputError(f"Frame {frame.name} has no labels to compare with; take a split of labelled frames.")
-    rows = read_rows(path)
-    points = np.zeros(len(rows), np.int64)
-    points[[row.type != DONT_CARE for row in rows]] = inside
-    return labels_from_rows(rows)._replace(points=points)
-
-
 def _kind(text: str, sources: Iterable[Path]) -> str:
-    """What a warning says whatever the frame: without its files and numbers."""
+    """Return a warning without its files and numbers, which is the same for all frames."""
     for path in sources:
         text = text.replace(str(path), "")
     return re.sub(r"\d[\d.e+]*", "", text)
 
 
-def _dropped(frames: Sequence[ScoredFrame]) -> list[str]:
-    """What was not used, summed over the frames, one phrase for each reason."""
+def _dropped(frames: Sequence[Scored]) -> list[str]:
+    """Return what was dropped, summed over the frames, one phrase per reason."""
     amounts: dict[str, list[int]] = {}
     for frame in frames:
         counts = frame.result.counts

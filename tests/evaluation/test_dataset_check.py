@@ -10,8 +10,7 @@ import pytest
 from mini_folders import NAMES, OBJECTS, full_cloud, object_points, write_custom, write_kitti, write_split
 
 from ciassd_jax import car, tiny
-from ciassd_jax.evaluation.dataset_check import check_dataset
-from ciassd_jax.evaluation.findings import Finding, Report
+from ciassd_jax.evaluation.dataset_check import Finding, Report, check_dataset
 from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.kitti_rows import read_rows, write_rows
 from ciassd_jax.formats.points import write_bin
@@ -63,7 +62,7 @@ def test_sound_data_give_no_finding(tmp_path: Path) -> None:
     write_split(root, "val", *NAMES[2:])
     report = check_dataset(root, config=tiny())
     assert report.findings == ()
-    assert [frame.name for frame in report.frames] == list(NAMES)
+    assert [one.frame.name for one in report.frames] == list(NAMES)
     assert {name: row.objects for name, row in report.types.items()} == dict.fromkeys(OBJECTS, 3)
     car_row = report.types["Car"]
     np.testing.assert_allclose((*car_row.size, car_row.center_z), (3.9, 1.6, 1.5, -1.0), atol=1e-3)
@@ -75,7 +74,7 @@ def test_sound_custom_data_give_no_finding(tmp_path: Path) -> None:
     report = check_dataset(write_custom(tmp_path), config=tiny())
     assert report.findings == ()
     assert [frame.points for frame in report.frames] == [len(full_cloud(0))] * 2
-    assert {frame.camera for frame in report.frames} == {None}
+    assert {one.frame.camera for one in report.frames} == {None}
 
 
 LABEL, CALIB = r"label_2/000000\.txt, line", r"calib/000000\.txt"
@@ -97,7 +96,7 @@ LABEL, CALIB = r"label_2/000000\.txt, line", r"calib/000000\.txt"
             rf"{LABEL} 1: the type 'car' is none of KITTI's; write",
         ),
         (edit("training/calib/000000.txt", "P2:", "P9:"), True, rf"{CALIB} has no line P2; use"),
-        (edit_rows(rotation_y=90.0), True, rf"{LABEL} 1: the heading 90 is outside \[-pi, pi\]; write it in radians"),
+        (edit_rows(rotation_y=90.0), True, rf"{LABEL} 1: the heading 90 is outside \[-pi, pi\]; wrap it, in radians"),
         (edit_rows(bbox=(5, 9, 5, 20)), True, rf"{LABEL} 1: the image box is empty; write"),
         (edit_rows(truncated=-1.0), True, rf"{LABEL} 1: truncation must lie in 0\.\.1 and occlusion"),
         (edit_rows(occluded=4), True, rf"{LABEL} 1: truncation must lie in 0\.\.1 and occlusion"),
@@ -150,7 +149,7 @@ def test_files_that_are_missing_or_truncated(tmp_path: Path) -> None:
     assert "(000000); copy them" in first
     assert "1 of 3 frames have no label" in second
     assert third.startswith(f"{cloud} has ")
-    assert [frame.name for frame in report.frames] == ["000001"]
+    assert [one.frame.name for one in report.frames] == ["000001"]
 
 
 def test_labels_of_another_calibration(tmp_path: Path) -> None:
@@ -200,17 +199,17 @@ def test_split_files(tmp_path: Path) -> None:
     assert texts[0] == f"{root}/ImageSets/train.txt: frame 000001 is listed 2 times; list it once."
     assert texts[1].startswith(f"{root}/ImageSets/train.txt: 1 of 4 frames have no cloud ")
     assert texts[2] == (
-        f"{root}/ImageSets: train.txt and val.txt share 1 frames, the first 000001; take them off one of the two."
+        f"{root}/ImageSets: train.txt and val.txt share 1 frames, the first 000001; remove them from one of the two."
     )
     report = check_dataset(root, "train", config=tiny())
-    assert [frame.name for frame in report.frames] == ["000000", "000001"]
+    assert [one.frame.name for one in report.frames] == ["000000", "000001"]
     assert [finding.kind for finding in report.findings] == ["split"] + ["missing file"] * 3
 
 
 def test_the_official_list_where_frames_are_missing(tmp_path: Path) -> None:
     report = check_dataset(write_kitti(tmp_path), "train", config=tiny())
     assert "The official list of train: 3711 of 3712 frames have no cloud" in report.findings[0].text
-    with pytest.raises(InputError, match=r"names no frame that is there; check the path"):
+    with pytest.raises(InputError, match=r"names no frame that exists; check the path"):
         check_dataset(tmp_path, "test")
 
 
@@ -263,8 +262,8 @@ def test_sizes_of_custom_labels(tmp_path: Path) -> None:
     (root / "labels/a.txt").write_text("5 0 -1 4 0 1.5 7 Car\n")
     texts = {f.kind: f.text.split("a.txt, ")[1] for f in check_dataset(root, config=tiny()).findings if f.serious}
     assert texts == {
-        "size": "line 1: the size 4 x 0 x 1.5 is not positive; mend or remove the line.",
-        "heading": "line 1: the heading 7 is outside [-pi, pi]; write it in radians, wrapped.",
+        "size": "line 1: the size 4 x 0 x 1.5 is not positive; correct or remove the line.",
+        "heading": "line 1: the heading 7 is outside [-pi, pi]; wrap it, in radians.",
     }
 
 

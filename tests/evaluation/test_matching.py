@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ciassd_jax.evaluation.matching import assign, order_candidates, pick_thresholds
+from ciassd_jax.evaluation.matching import assign, order_pairs, pick_thresholds
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -16,9 +16,9 @@ def test_agrees_with_the_plain_loop(seed: int) -> None:
     # Few values, so that ties are common.
     wish = rng.integers(0, 3, len(truth)).astype(float)
     score = rng.random(num_frames * per_frame)
-    candidates = order_candidates(truth, detection, frame, wish)
-    visible = score[candidates.detection] >= thresholds[:, None]
-    chosen, taken = assign(candidates, visible, len(score))
+    ordered = order_pairs(truth, detection, frame, wish)
+    visible = score[ordered.detection] >= thresholds[:, None]
+    chosen, taken = assign(ordered, visible, len(score))
     for row, threshold in enumerate(thresholds):
         used: set[int] = set()
         pairs = set()
@@ -28,15 +28,15 @@ def test_agrees_with_the_plain_loop(seed: int) -> None:
             if free:
                 used.add(min(free)[1])
                 pairs.add((wanting, min(free)[1]))
-        ours = set(zip(candidates.truth[chosen[row]], candidates.detection[chosen[row]], strict=True))
+        ours = set(zip(ordered.truth[chosen[row]], ordered.detection[chosen[row]], strict=True))
         assert ours == pairs
         assert set(np.flatnonzero(taken[row])) == used
 
 
 def test_nothing_to_match() -> None:
     none = np.zeros(0, np.int64)
-    candidates = order_candidates(none, none, none, np.zeros(0))
-    chosen, taken = assign(candidates, np.ones((3, 0), bool), 4)
+    ordered = order_pairs(none, none, none, np.zeros(0))
+    chosen, taken = assign(ordered, np.ones((3, 0), bool), 4)
     assert (chosen.shape, taken.sum()) == ((3, 0), 0)
 
 

@@ -50,7 +50,7 @@ def test_an_empty_result_file_is_a_frame_without_detections(folders: tuple[Path,
         ("Car 0 0", r"Rows of fewer than 16 columns were left out: 1 in all, the first is .*000002.txt, line 2\."),
         (
             format_row(found(label(7), 0.1)) + " 7",
-            r"more than 16 columns the surplus was skipped: 1 in all, .*line 2\.",
+            r"more than 16 columns was ignored: 1 in all, .*line 2\.",
         ),
         (
             format_row(found(label(2), 0.7)),

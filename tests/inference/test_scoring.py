@@ -1,6 +1,7 @@
 """A detector over a data set: what is evaluated, what is written, and what is summed over the frames."""
 
 import re
+import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,6 +22,7 @@ from ciassd_jax.formats.kitti_rows import parse_row
 from ciassd_jax.formats.points import read_points, write_bin
 from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.inference.scoring import detect_dataset, find_trained, score_dataset, score_frames, write_frames
+from ciassd_jax.simulation import Lidar, open_synthetic
 
 Detect = Callable[[np.ndarray], tuple[np.ndarray, tuple[str, ...]]]
 # Four decimals of metres and pixels move an overlap past its limit, or join two scores, only now and then.
@@ -171,11 +173,36 @@ def test_track_sees_the_names(tmp_path: Path) -> None:
     assert seen == ["a", "b"]
 
 
+def test_frames_in_memory_score_like_those_of_files(tmp_path: Path) -> None:
+    dataset = open_dataset(write_kitti(tmp_path), "all")
+    frames = {name: dataset.read_frame(name) for name in dataset.names}
+    score = to_json(score_dataset(blurred_truth(dataset), dataset))
+    shutil.rmtree(tmp_path)
+    in_memory = Dataset(dataset.names, frames.__getitem__)
+    assert to_json(score_dataset(blurred_truth(in_memory), in_memory)) == score
+
+
+def test_synthetic_frames_can_be_scored() -> None:
+    dataset = open_synthetic(seed=3, frames=2, lidar=Lidar(columns=128))
+    truth = iter([dataset.read(index) for index in range(2)])
+
+    def find(points: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        frame = next(truth)
+        return frame.boxes.to_array(), frame.names
+
+    evaluation = score_dataset(Oracle(find), dataset)
+    assert evaluation.has_camera
+    cars = evaluation.curves["Car", "3d", 0.7]
+    assert cars is not None
+    assert cars[2].num_truths > 0
+    assert evaluation.precision("Car", "3d", 0.7)[2] > 0
+
+
 def test_frames_without_labels_are_refused(tmp_path: Path) -> None:
     root = write_kitti(tmp_path, part="testing")
     (root / "ImageSets").mkdir()
     (root / "ImageSets/test.txt").write_text("000001\n")
-    with pytest.raises(InputError, match=r"^Frame 000001 has no labels to compare with; take a split of labelled"):
+    with pytest.raises(InputError, match=r"^Frame 000001 has no labels to compare with; choose a split of labelled"):
         detect_dataset(Oracle(nothing), open_dataset(root, "test"))
 
 
