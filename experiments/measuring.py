@@ -27,6 +27,7 @@ from ciassd_jax.model.anchors import make_anchors
 from ciassd_jax.model.network import RawPredictions, predict_raw
 from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.ops.iou import iou_3d
+from ciassd_jax.training.validation import precision_of
 from ciassd_jax.types import Candidates, PointCloud, Predictions, Variables
 
 _predict_raw = jax.jit(predict_raw)
@@ -142,20 +143,20 @@ def nearest_overlap(boxes: Boxes, truth: Boxes) -> np.ndarray:
     return np.asarray(iou_3d(boxes, Boxes(*(leaf[nearest] for leaf in truth))))
 
 
-def precisions(evaluations: Sequence[Evaluation], name: str = "Car") -> dict[str, list[float]]:
-    """AP in percent of one class by measure, one value for each evaluation: the paper's R11 first, then R40."""
-    columns = {}
-    for title, metric, limit, recall, level in (
-        ("3D R11 easy", "3d", 0.7, "R11", 0),
-        ("3D R11 moderate", "3d", 0.7, "R11", 1),
-        ("3D R11 hard", "3d", 0.7, "R11", 2),
-        ("3D R40 moderate", "3d", 0.7, "R40", 1),
-        ("BEV R40 moderate", "bev", 0.7, "R40", 1),
-        ("3D R40 moderate at 0.5", "3d", 0.5, "R40", 1),
-    ):
-        values = [evaluation.precision(name, metric, limit, recall) for evaluation in evaluations]  # type: ignore[arg-type]
-        columns[title] = [0.0 if value is None else value[level] for value in values]
-    return columns
+def precision_columns(evaluations: Sequence[Evaluation], name: str = "Car") -> dict[str, list[float]]:
+    """Return the columns of a table: AP in percent of one class, one value per evaluation; the paper's R11 first."""
+    measures = {
+        "3D R11 easy": ("3d", 0.7, "R11", 0),
+        "3D R11 moderate": ("3d", 0.7, "R11", 1),
+        "3D R11 hard": ("3d", 0.7, "R11", 2),
+        "3D R40 moderate": ("3d", 0.7, "R40", 1),
+        "BEV R40 moderate": ("bev", 0.7, "R40", 1),
+        "3D R40 moderate at 0.5": ("3d", 0.5, "R40", 1),
+    }
+    return {
+        title: [precision_of(evaluation, name, *measure) for evaluation in evaluations]  # type: ignore[arg-type]
+        for title, measure in measures.items()
+    }
 
 
 def is_too_small(rows: Sequence[Mapping[str, Any]], column: str = "3D R40 moderate") -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from experiment_report import Report
-from measuring import is_too_small, precisions, score_settings
+from measuring import is_too_small, precision_columns, score_settings
 from plots import plot_bars
 from study import Study, with_detection, with_neck, without_iou
 
@@ -39,7 +39,7 @@ def run(study: Study) -> Report:
         settings = {title: with_detection(config, nms="rotated")}
         networks = study.networks(f"table3-{row}-{switch or 'nothing'}", config)
         found = [score_settings(one, config, settings, study.validation())[title] for one in networks]
-        rows.append({"data": title, **precisions(found)})
+        rows.append({"data": title, **precision_columns(found)})
     notes = ["The paper's numbers of this table were not available. Each row adds its switch to the row above."]
     if is_too_small(rows, PLOTTED):
         notes.append(f"No row reaches 1 % in {PLOTTED}: the budget is too small to compare them.")

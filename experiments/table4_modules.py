@@ -9,7 +9,7 @@ trainings per seed: rectification and NMS only change the post-processing. Resul
 from __future__ import annotations
 
 from experiment_report import Report
-from measuring import is_too_small, precisions, score_settings
+from measuring import is_too_small, precision_columns, score_settings
 from plots import plot_bars
 from study import Study, with_detection, with_neck, without_iou
 
@@ -42,7 +42,7 @@ def run(study: Study) -> Report:
         for title in settings:
             paper = PAPER if title == WHOLE else None
             rows.append(
-                {"modules": title, **precisions([one[title] for one in found]), "paper, 3D R11 moderate": paper}
+                {"modules": title, **precision_columns([one[title] for one in found]), "paper, 3D R11 moderate": paper}
             )
     return Report("Table 4: the modules", rows, (judge_order(rows),), {"": plot_bars(rows, "3D R40 moderate")})
 

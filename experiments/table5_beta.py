@@ -10,7 +10,7 @@ README.md.
 from __future__ import annotations
 
 from experiment_report import Report
-from measuring import precisions, score_and_decode
+from measuring import precision_columns, score_and_decode
 from plots import plot_beta
 from study import Study, with_detection
 
@@ -30,7 +30,7 @@ def run(study: Study) -> Report:
     rows = []
     for beta in BETAS:
         pcc = [pearson(boxes.confidence(beta), boxes.overlap) for boxes in decoded]
-        rows.append({"beta": beta, **precisions([one[str(beta)] for one in found]), "PCC": pcc})
+        rows.append({"beta": beta, **precision_columns([one[str(beta)] for one in found]), "PCC": pcc})
     notes = [_maximum(rows, "3D R40 moderate"), _maximum(rows, "PCC")]
     notes.append(f"PCC over {sum(len(boxes.overlap) for boxes in decoded):,} boxes. The paper uses beta = 4.")
     return Report("Table 5: beta", rows, notes, {"": plot_beta(rows, "3D R40 moderate")})

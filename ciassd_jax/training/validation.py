@@ -11,7 +11,7 @@ from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.scenes import target_labels
 from ciassd_jax.evaluation import Evaluation, format_json, format_report
-from ciassd_jax.evaluation.kitti_ap import LIMITS
+from ciassd_jax.evaluation.kitti_ap import LIMITS, Metric, Recall
 from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.writing import write_text
 from ciassd_jax.inference.detector import Detector
@@ -49,13 +49,22 @@ def precisions(evaluation: Evaluation, config: Config) -> dict[str, float]:
     is 0 here.
     """
     name = next((name for name in config.class_names if name in LIMITS), None)
-    found = {}
-    for metric in ("3d", "bev"):
-        for limit in LIMITS[name] if name is not None else ():
-            precision = evaluation.precision(name, metric, limit) if name is not None else None
-            moderate = precision[1] if precision is not None else 0.0
-            found[f"{name}_{metric}_{limit:.2f}_moderate_R40"] = float(np.nan_to_num(moderate))
-    return found
+    if name is None:
+        return {}
+    metrics: tuple[Metric, ...] = ("3d", "bev")
+    return {
+        f"{name}_{metric}_{limit:.2f}_moderate_R40": precision_of(evaluation, name, metric, limit)
+        for metric in metrics
+        for limit in LIMITS[name]
+    }
+
+
+def precision_of(
+    evaluation: Evaluation, name: str, metric: Metric, limit: float, recall: Recall = "R40", level: int = 1
+) -> float:
+    """Return AP in percent at a level of difficulty (0 easy, 1 moderate, 2 hard); 0 if nothing was evaluated."""
+    levels = evaluation.precision(name, metric, limit, recall)
+    return 0.0 if levels is None else float(np.nan_to_num(levels[level]))
 
 
 def count_found(
