@@ -1,4 +1,4 @@
-"""What a file that cannot be used raises, and what one that can be used in part warns of."""
+"""The error for input that cannot be used, the warnings for input used in part, and reading of files."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ Pathlike = str | os.PathLike[str]
 
 
 class InputError(ValueError):
-    """A file cannot be used; the message is one sentence that names it and the remedy."""
+    """An input cannot be used; the message is one sentence that names it and the remedy."""
 
 
 class FormatWarning(UserWarning):
-    """A file was read, but lacks something; the message names it and what stands in for it."""
+    """A file lacks something; the message names it and the substitute."""
 
 
 class DroppedWarning(UserWarning):
-    """Part of the input was not used; the message says how much and why."""
+    """Part of the input was dropped; the message tells how much and why."""
 
 
 def read_bytes(path: Pathlike, limit: int = -1) -> bytes:
     """Read a file, or its first `limit` bytes.
 
-    Raises InputError if there is no such file, or it is a directory or unreadable.
+    Raises InputError for a path that does not exist, is a directory or cannot be read.
     """
     try:
         with open(path, "rb") as stream:

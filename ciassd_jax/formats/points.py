@@ -1,6 +1,6 @@
 """Point clouds in `.bin` (KITTI), `.npy`, `.npz` and `.pcd` files.
 
-Readers return what the file says; cleaning (NaN, `scale_intensity`) is left to the caller.
+Readers return the values of the file; cleaning (NaN, `scale_intensity`) is left to the caller.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _INTENSITY_FIELDS = ("intensity", "reflectance", "i")
 _PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
-# Garbage bytes read as floats are data to clean, not arithmetic to warn of.
+# Arbitrary bytes read as floats need no warnings of NumPy's arithmetic.
 @np.errstate(over="ignore", invalid="ignore")
 def read_points(path: Pathlike, width: int = 4) -> Float32[np.ndarray, "N 4"]:
     """Read a point cloud as (x, y, z, intensity), coordinates in metres.
@@ -31,8 +31,8 @@ def read_points(path: Pathlike, width: int = 4) -> Float32[np.ndarray, "N 4"]:
     - `.npy`, `.npz`: an array (N, 3 or more); in an archive the array `points`, or the only one.
     - `.pcd`: ascii or binary, fields x, y, z and one of intensity, reflectance, i.
 
-    Columns after the fourth are ignored. Where there is no intensity it is 0, and a warning says so.
-    Raises InputError, one sentence with the remedy, for a file that is missing, empty or malformed.
+    Columns after the fourth are ignored. A missing intensity becomes 0, with a FormatWarning. Raises InputError, one
+    sentence with the remedy, for a file that is missing, empty or malformed.
     """
     if width < 3:
         raise ValueError(f"width is {width}; a point has at least the 3 numbers x, y, z.")
@@ -57,7 +57,10 @@ def write_bin(path: Pathlike, points: Float[np.ndarray, "N 4"]) -> None:
 
 
 def scale_intensity(points: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, "N 4"], float | None]:
-    """Points with intensity in [0, 1]: divided by 255 where it exceeds 2; then also its largest value before."""
+    """Return points with intensity in [0, 1], and its largest value before if it had to be scaled, else None.
+
+    Intensities are divided by 255 if they exceed 2.
+    """
     intensity = points[:, 3]
     top = float(intensity.max(initial=0, where=np.isfinite(intensity)))
     if top <= 2:
@@ -66,7 +69,7 @@ def scale_intensity(points: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndar
 
 
 def _as_points(array: np.ndarray, path: Pathlike) -> Float32[np.ndarray, "N 4"]:
-    """Take the first four columns, or three and intensity 0."""
+    """Return the first four columns, or three and intensity 0."""
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
         raise InputError(
             f"{path} holds an array of shape {array.shape} and type {array.dtype}; "
@@ -84,13 +87,13 @@ def _read_bin(data: bytes, path: Pathlike, width: int) -> Float32[np.ndarray, "N
     if len(data) % (4 * width):
         raise InputError(
             f"{path} has {len(data)} bytes, not a multiple of {4 * width} ({width} float32 per point); "
-            "copy it again, or pass the true number as `width`."
+            "copy it again, or pass the correct number as `width`."
         )
     return np.frombuffer(data, "<f4").reshape(-1, width)
 
 
 def _read_numpy(data: bytes, path: Pathlike, *, archive: bool) -> np.ndarray:
-    """Read an array, or the one array of an archive that can be meant, without unpickling anything."""
+    """Read an array, or the array `points` or only array of an archive, without unpickling anything."""
     try:
         if not archive:
             return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
@@ -98,9 +101,9 @@ def _read_numpy(data: bytes, path: Pathlike, *, archive: bool) -> np.ndarray:
             names = arrays.files
             if "points" in names or len(names) == 1:
                 return np.asarray(arrays["points" if "points" in names else names[0]])
-    except Exception as error:  # NumPy and zipfile meet garbage with half a dozen types of error
+    except Exception as error:  # on malformed bytes NumPy and zipfile raise half a dozen types of error
         raise InputError(
-            f"{path} is cut short or no {'.npz' if archive else '.npy'} file of plain numbers; "
+            f"{path} is cut short or not a {'.npz' if archive else '.npy'} file of plain numbers; "
             f"write it again with np.{'savez' if archive else 'save'}."
         ) from error
     raise InputError(
@@ -110,7 +113,7 @@ def _read_numpy(data: bytes, path: Pathlike, *, archive: bool) -> np.ndarray:
 
 
 class _PcdField(NamedTuple):
-    """Where a field lies in a row: its first byte, its first column, and its type."""
+    """The position of a field in a row, by byte and by column, and its type."""
 
     offset: int
     column: int
@@ -153,7 +156,7 @@ def _read_pcd_ascii(
     try:
         values = np.array(body.split(), np.float64)
     except ValueError as error:
-        raise InputError(f"{path} has a point that is no number; save it again.") from error
+        raise InputError(f"{path} has a point that is not a number; save it again.") from error
     if values.size != header.num_points * header.columns:
         raise InputError(
             f"{path} announces {header.num_points} points of {header.columns} numbers "
@@ -165,7 +168,7 @@ def _read_pcd_ascii(
 def _read_pcd_binary(
     body: bytes, path: Pathlike, header: _PcdHeader, fields: list[_PcdField]
 ) -> Float[np.ndarray, "N columns"]:
-    # A few bytes after the last point are harmless: some writers end the file with a newline.
+    # A few bytes after the last point are allowed, because some writers end the file with a newline.
     if len(body) // header.stride != header.num_points:
         raise InputError(
             f"{path} announces {header.num_points} points of {header.stride} bytes "
@@ -197,7 +200,7 @@ def _read_pcd_header(data: bytes, path: Pathlike) -> tuple[_PcdHeader, bytes]:
 
 
 def _parse_pcd_header(entries: dict[str, list[str]]) -> _PcdHeader:
-    """Lay out a row; raises LookupError, TypeError or ValueError for a missing or senseless entry."""
+    """Parse the entries; raises LookupError, TypeError or ValueError for a missing or invalid one."""
     names = entries["FIELDS"]
     counts = [int(count) for count in entries.get("COUNT", ["1"] * len(names))]
     fields: dict[str, _PcdField] = {}

@@ -1,9 +1,9 @@
-"""Reader of PyTorch weights files, without PyTorch and without running anything that a file asks for.
+"""Reader of PyTorch weights files, without PyTorch and without running code from a file.
 
-Both formats are read: the zip archive (`NAME/data.pkl` and a record `NAME/data/KEY` for each storage) and
-the older row of pickles with the raw storages behind them. The work has two steps. `_Recorder` only notes
-what the file says: every name that it may mention (`_GLOBALS`) stands for a string or an inert object of
-this module, and every other name is an error. Then `_Resolver` checks the notes and turns them into arrays.
+Both formats are read: the zip archive (`NAME/data.pkl` and a record `NAME/data/KEY` per storage), and the older
+sequence of pickles followed by the raw storages. `_Recorder` unpickles into inert records: the names that a file may
+mention (`_GLOBALS`) stand for strings or inert objects of this module, and any other name is an error. `_Resolver` then
+checks the records and converts them to arrays.
 """
 
 import io
@@ -37,30 +37,30 @@ _STORAGES = {
     "LongStorage": "int64",
     "ShortStorage": "int16",
 }
-# A bfloat16 is read as its bits, the upper half of a float32.
+# A bfloat16 is read as its bits, which are the upper half of a float32.
 _DTYPES = {name: np.dtype("uint16" if name == "bfloat16" else name).newbyteorder("<") for name in _STORAGES.values()}
 
 
 def read_torch_file(path: Pathlike) -> dict[Any, Any]:
-    """The content of a file written by `torch.save`, as plain data.
+    """Return the content of a file written by `torch.save` as plain data.
 
-    Containers, numbers, strings, bytes and None are returned as they are (an `OrderedDict` as a `dict`, a
-    NumPy scalar as a number, a torch dtype or device as its name) and a tensor as an array of its type,
-    bfloat16 as float32. The arrays of tensors are read-only; those that share a storage share memory.
+    Containers, numbers, strings, bytes and None are returned unchanged, an `OrderedDict` as a `dict`, a NumPy scalar as
+    a number, a torch dtype or device as its name, and a tensor as a read-only array of its type, bfloat16 as float32.
+    Arrays that share a storage share memory.
 
-    Raises InputError for everything else: a missing, foreign or damaged file, or one that asks to run code.
+    Raises InputError for a missing, foreign or damaged file, and for one that asks to run code.
     """
     raw = read_bytes(path)
     try:
         content = _read_zip(raw) if raw.startswith(b"PK\x03\x04") else _read_old(raw)
         if not isinstance(content, dict):
-            raise InputError("holds no dictionary; save the model's state_dict with `torch.save`.")
+            raise InputError("does not hold a dictionary; save the model's state_dict with `torch.save`.")
         return content
     except InputError as error:
         raise InputError(f"{path} {error}") from None
     except Exception as error:
-        # Malformed bytes make pickle, zipfile, zlib, struct and NumPy raise a dozen kinds of error.
-        raise InputError(f"{path} is damaged or is no PyTorch weights file; {_AGAIN}") from error
+        # On malformed bytes pickle, zipfile, zlib, struct and NumPy raise a dozen types of error.
+        raise InputError(f"{path} is damaged or not a PyTorch weights file; {_AGAIN}") from error
 
 
 def _read_zip(raw: bytes) -> Any:
@@ -83,8 +83,8 @@ def _read_old(raw: bytes) -> Any:
         raise InputError(f"is empty; {_AGAIN}")
     file = io.BytesIO(raw)
     if _Recorder(file).load() != _OLD_MAGIC or _Recorder(file).load() != _OLD_PROTOCOL:
-        raise InputError(f"is no PyTorch weights file; {_AGAIN}")
-    _Recorder(file).load()  # the writer's byte order and type sizes; storages are little-endian all the same
+        raise InputError(f"is not a PyTorch weights file; {_AGAIN}")
+    _Recorder(file).load()  # the writer's byte order and type sizes; storages are little-endian in any case
     recorder = _Recorder(file)
     content = recorder.load()
     storages = {}
@@ -98,16 +98,16 @@ def _read_old(raw: bytes) -> Any:
 
 
 class _Inert:
-    """Base of what stands for PyTorch's and NumPy's objects: the file cannot set anything on it."""
+    """Base of the stand-ins for PyTorch's and NumPy's objects; a file cannot set attributes on them."""
 
     __slots__ = ()
 
     def __setstate__(self, state: object) -> None:
-        raise InputError(f"sets the inner state of an object, as no weights file does; {_AGAIN}")
+        raise InputError(f"sets the inner state of an object, which weights files never do; {_AGAIN}")
 
 
 class _Global(_Inert):
-    """A function or class that the file may name; calling it makes plain data or a record."""
+    """A function or class that a file may name; calling it returns plain data or a record."""
 
     __slots__ = ("make",)
 
@@ -119,7 +119,7 @@ class _Global(_Inert):
 
 
 class _Record(_Inert):
-    """A call that the file asks for: `_Resolver` answers it with `build` once everything is read."""
+    """A call that a file asks for; `_Resolver` runs `build` once everything is read."""
 
     __slots__ = ("arguments", "build")
 
@@ -128,7 +128,7 @@ class _Record(_Inert):
 
 
 class _RecordWithState(_Record):
-    """A record whose state, which a pickle sets after the call, becomes its last argument."""
+    """A record that appends the state, which a pickle sets after the call, to its arguments."""
 
     __slots__ = ()
 
@@ -137,17 +137,14 @@ class _RecordWithState(_Record):
 
 
 class _OrderedDict(dict[Any, Any]):
-    """A dictionary without the attributes that the file sets, such as the `_metadata` of a state_dict."""
+    """A dictionary that ignores the attributes a file sets, such as the `_metadata` of a state_dict."""
 
     def __setstate__(self, state: object) -> None:
         pass
 
 
 class _Recorder(pickle._Unpickler):
-    """Unpickler that imports nothing and runs nothing.
-
-    It extends the one in Python: the one in C allocates as much memory as the largest memo number demands.
-    """
+    """Unpickler that imports and runs nothing; in Python, because C's allocates memory for the largest memo index."""
 
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, encoding="utf-8")
@@ -171,7 +168,7 @@ class _Recorder(pickle._Unpickler):
 
 
 class _Resolver:
-    """Turns what `_Recorder` noted into plain data; what is shared stays shared."""
+    """Converts the records of `_Recorder` to plain data; shared objects stay shared."""
 
     def __init__(self, storages: Mapping[str, bytes]) -> None:
         self.storages = storages
@@ -198,7 +195,7 @@ class _Resolver:
         raise InputError(f"holds something other than tensors and plain data; {_ALONE}")
 
     def vector(self, key: str, dtype: str) -> np.ndarray:
-        """All bytes of a storage as read-only numbers."""
+        """Return all bytes of a storage as read-only numbers."""
         if (key, dtype) not in self.vectors:
             raw = self.storages[key]
             numbers = np.ndarray((len(raw) // _DTYPES[dtype].itemsize,), _DTYPES[dtype], raw).copy()
@@ -212,7 +209,7 @@ class _Resolver:
 
 
 def _check_inside(vector: np.ndarray, offset: Any, size: Any, stride: Any) -> None:
-    """Refuses a view that is malformed or reaches outside `vector`."""
+    """Raise InputError for a view that is malformed or reaches outside `vector`."""
     well_formed = all(isinstance(number, int) and number >= 0 for number in (offset, *size, *stride))
     if well_formed and len(size) == len(stride):
         last = offset + sum((count - 1) * step for count, step in zip(size, stride, strict=True))
@@ -222,9 +219,9 @@ def _check_inside(vector: np.ndarray, offset: Any, size: Any, stride: Any) -> No
 
 
 def _storage(resolver: _Resolver, key: str, dtype: str, count: int, view: Any = None) -> np.ndarray:
-    """A storage, or its part `view` = (name, offset, count), as a vector."""
+    """Return a storage, or its part `view` = (name, offset, count), as a vector."""
     if len(resolver.storages[key]) != count * _DTYPES[dtype].itemsize:
-        raise InputError(f"holds a storage of another size than it says; {_AGAIN}")
+        raise InputError(f"holds a storage whose size is not the announced one; {_AGAIN}")
     vector = resolver.vector(key, dtype)
     if view is None:
         return vector
@@ -234,7 +231,7 @@ def _storage(resolver: _Resolver, key: str, dtype: str, count: int, view: Any = 
 
 
 def _tensor(resolver: _Resolver, storage: Any, offset: Any, size: Any, stride: Any, *rest: Any) -> np.ndarray:
-    """A strided view of a storage; `rest` = (requires_grad, hooks, metadata), any of them absent."""
+    """Return a strided view of a storage; `rest` is a prefix of (requires_grad, hooks, metadata)."""
     if not isinstance(storage, _Record) or storage.build is not _storage:
         raise InputError(f"holds a tensor without a storage; {_AGAIN}")
     if len(rest) > 2 and rest[2]:
@@ -252,7 +249,7 @@ def _parameter(resolver: _Resolver, data: Any, *flags_and_hooks: Any) -> Any:
 
 
 def _numpy_dtype(resolver: _Resolver, code: Any, align: Any, copy: Any, state: Any) -> np.dtype:
-    """A type of numbers or characters, never of objects: NumPy would take any bytes for their addresses."""
+    """Return a type of numbers or characters; in one of objects NumPy would read any bytes as addresses."""
     if not re.fullmatch("[biufc][1248]|c16|[SU][1-9][0-9]{0,3}", code) or state[1] not in tuple("<>|="):
         raise InputError(f"holds a NumPy array of something other than numbers; {_ALONE}")
     return np.dtype(state[1] + code)
@@ -276,7 +273,7 @@ def _device(kind: Any, *index: Any) -> str:
 
 
 def _encode(text: Any, encoding: Any) -> bytes:
-    """How pickles of protocol 2 write bytes."""
+    """Return bytes as pickles of protocol 2 write them."""
     if encoding != "latin1":
         raise InputError(f"holds bytes written in an unknown way; {_AGAIN}")
     return text.encode("latin1")

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Writing of files, whole or not at all."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ciassd_jax.formats.errors import InputError, Pathlike
 
 
 def check_folder(folder: Pathlike) -> None:
-    """Raise InputError unless files can be written in `folder`, which need not exist yet; creates nothing."""
+    """Raise InputError unless files can be written in `folder`, which may not exist yet; creates nothing."""
     path = Path(folder).absolute()
     existing = next(p for p in (path, *path.parents) if os.path.lexists(p))
     if not existing.is_dir():
@@ -22,9 +22,9 @@ def check_folder(folder: Pathlike) -> None:
 
 @contextmanager
 def replacing(path: Pathlike) -> Iterator[Path]:
-    """A path beside `path` to write to; it takes that place when the block ends well and is removed otherwise.
+    """Yield a temporary path that replaces `path` when the block succeeds, and is removed otherwise.
 
-    The folder is made where it is missing. Raises InputError for what the operating system refuses.
+    Creates the folder if it is missing. Raises InputError for errors of the operating system.
     """
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
@@ -35,12 +35,12 @@ def replacing(path: Pathlike) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror}); choose another place.") from error
     finally:
-        # Below a file even the removal of nothing is an error.
+        # If a parent is a file, `unlink(missing_ok=True)` would raise.
         if temporary.exists():
             temporary.unlink()
 
 
 def write_text(path: Pathlike, text: str) -> None:
-    """Write a file of text with a line end, whole or not at all."""
+    """Write text and a line end to a file, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(f"{text}\n", encoding="utf-8")

@@ -51,7 +51,7 @@ compiled = {name: jax.jit(function) for name, function in (("flip", flip), ("rot
 
 
 def random_boxes(rng: np.random.Generator, number: int, reach: float = 6.0) -> np.ndarray:
-    """Cars and the like (N, 7) within `reach` metres of (6, 0)."""
+    """Boxes of cars' sizes (N, 7) within `reach` metres of (6, 0)."""
     center = np.array([6, 0, -1]) + rng.uniform(-reach, reach, (number, 3)) * [1, 1, 0.05]
     size = np.array([3.9, 1.6, 1.5]) * rng.uniform(0.4, 1.2, (number, 1))
     return np.concatenate([center, size, rng.uniform(-4, 4, (number, 1))], 1).astype(np.float32)
@@ -84,7 +84,7 @@ def make_scene(points: np.ndarray, boxes: np.ndarray, label: np.ndarray) -> Scen
 
 
 def random_scene(seed: int, number: int = 6, reach: float = 6.0) -> Scene:
-    """Boxes of which some are obstacles, points in them and around."""
+    """Boxes, some of them obstacles, with points inside and around."""
     rng = np.random.default_rng(seed)
     boxes = random_boxes(rng, number, reach)
     around = np.concatenate([rng.uniform([0, -6, -2], [12, 6, 0], (100, 3)), rng.random((100, 1))], 1)
@@ -105,7 +105,7 @@ def make_objects(boxes: np.ndarray, points: np.ndarray, owner: np.ndarray, valid
 
 
 def random_objects(seed: int, reach: float = 7.0, each: int = 10) -> SampledObjects:
-    """Draws of which some are missing, and `wanted` from none to all."""
+    """Sampled objects, some slots empty, and `wanted` from none to all."""
     rng = np.random.default_rng((seed, 1))
     valid = rng.random(OBJECTS) < 0.9
     boxes = random_boxes(rng, OBJECTS, reach) * valid[:, None]
@@ -152,11 +152,11 @@ def unstacked(batch, index: int):
     return jax.tree.map(lambda leaf: leaf[index], batch)
 
 
-# Pasting
+# Ground-truth sampling
 
 
 def test_draws_are_accepted_as_defined():
-    """SPEC 2.3, on 300 crowded scenes."""
+    """On 300 crowded scenes, against the loop."""
     scenes = [random_scene(seed) for seed in range(300)]
     objects = [random_objects(seed) for seed in range(300)]
     accepted = np.asarray(jax.jit(jax.vmap(accept))(stacked(scenes).truth, stacked(objects)))
@@ -182,17 +182,17 @@ def draws_at(places: list[float | None], wanted) -> SampledObjects:
 @pytest.mark.parametrize(
     ("places", "wanted", "expected"),
     [
-        # Of two that collide the earlier is out, even if the later collides with a truth box (at x = 0) itself.
+        # Of two that collide the earlier is rejected, even if the later collides with a truth box (at x = 0).
         ([5, 5.5, 8, None], (3, 0), [1, 2]),
         ([1.2, 0.5, 8, None], (3, 0), [2]),
         # A chain: each of the first two collides with its successor only.
         ([5, 5.8, 6.6, None], (3, 0), [2]),
-        # The second round has only as many draws as are wanted, and its draws do not see the unused ones.
+        # The second round has `wanted` draws, which ignore the unused ones.
         ([5, 0, None, None, 0, 8, 8.5, None], (3, 0), [0, 5]),
         ([5, 0, 7, None, 9, 9.5, 12, None], (3, 0), [0, 2, 4]),
         ([0, 0, 0, None, 5, 5.5, 9, None], (3, 0), [5, 6]),
         ([5, 7, 9, 11, 13, 15, 17, 19], (0, 0), []),
-        # The second class is drawn onto what the first left.
+        # The second class avoids the objects of the first.
         ([5, None, None, None, 7, None, None, None, 5.5, 9], (2, 2), [0, 4, 9]),
         ([5, None, None, None, 7, None, None, None, 9, 7.5, 9.5, 11], (2, 2), [0, 4, 8]),
     ],
@@ -247,7 +247,7 @@ def test_points_over_capacity_are_cut_from_the_end():
 
 @cache
 def noise_case() -> tuple[list[Scene], np.ndarray, np.ndarray, Scene]:
-    """120 crowded scenes with tries, and what becomes of them."""
+    """120 crowded scenes with tries, and the results."""
     scenes = [random_scene(seed, number=9) for seed in range(120)]
     rng = np.random.default_rng(0)
     shifts = rng.normal(0, [1, 1, 0.5], (120, BOXES, 8, 3)).astype(np.float32)
@@ -256,7 +256,7 @@ def noise_case() -> tuple[list[Scene], np.ndarray, np.ndarray, Scene]:
 
 
 def test_boxes_move_as_defined():
-    """SPEC 2.4; points within 1e-4 of a face of a box may follow it or not."""
+    """Against the loop; points within 1e-4 of a face of a box may move with it or not."""
     scenes, shifts, turns, batch = noise_case()
     moves = []
     for index, scene in enumerate(scenes):
@@ -320,7 +320,7 @@ def test_noise_has_the_given_spread():
 
 
 def test_flip_and_turn_in_the_papers_angle():
-    """SPEC 2.2: flip has r -> pi - r; a clockwise turn by theta has r += theta."""
+    """In the paper's angle r, a flip is r -> pi - r and a clockwise rotation by theta is r += theta."""
     scene = random_scene(0)
     before, theta = np.asarray(to_paper(scene.truth.boxes)), 0.6
     mirrored = np.asarray(to_paper(flip(scene, jnp.array(True)).truth.boxes))
@@ -376,7 +376,7 @@ def test_every_order_of_points_is_as_likely():
 
 
 def test_targets_in_range_are_kept():
-    """SPEC 1.6: one corner strictly inside is enough, and z is free."""
+    """One corner strictly inside is enough, at any z."""
     square = [2, 2, 1, 0]
     boxes = np.array(
         [
@@ -479,7 +479,7 @@ def test_one_switch_does_one_thing(switch):
         assert int(result.cloud.count) == int(scene.cloud.count)
         assert np.abs(real_points(result) - real_points(plain)).max() > 0.1
     if switch != "global_transform":
-        # Background stays, bit for bit.
+        # Background points keep their bits.
         background = ~np.any([inside(real_points(scene), box) for box in real_boxes(scene)], 0)
         rows = {row.tobytes() for row in real_points(result)}
         stays = [row.tobytes() in rows for row in real_points(scene)[background]]
@@ -505,7 +505,7 @@ def test_without_slots_nothing_is_added():
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**31 - 1))
 def test_augmented_scenes_keep_objects_apart(seed):
-    """However crowded, no pair of targets collides that did not before, and no point is lost uncounted."""
+    """Augmentation adds no collision between targets, and every lost point is counted."""
     scene, objects = random_scene(seed, number=10), random_objects(seed)
     result = compiled_augment(scene_key(seed, 0, 0), scene, objects, CONFIG)
     assert len(overlapping(real_boxes(result))) <= len(overlapping(real_boxes(scene)))

@@ -1,4 +1,4 @@
-"""One's own data in OpenPCDet's custom layout: no camera, no calibration."""
+"""Data in OpenPCDet's custom layout, without a camera."""
 
 import re
 from pathlib import Path

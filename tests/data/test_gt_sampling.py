@@ -1,4 +1,4 @@
-"""The ground-truth database: what it holds, what it refuses, and which objects a scene gets."""
+"""Ground-truth sampling: the content of the database, damaged files, and the objects drawn for a scene."""
 
 import pickle
 from dataclasses import replace
@@ -200,7 +200,7 @@ def draw(database, names=("Car", "Van", "Tram"), config=CONFIG, **numbers):
 
 def test_drawn_objects_have_their_class_and_points(database):
     objects = draw(database)
-    # One car is there and the van counts for nothing; four slots a round, of which three are drawn.
+    # The scene has one car, and the van does not count: three of the four slots per round are drawn.
     np.testing.assert_array_equal(objects.wanted, [3, 2])
     np.testing.assert_array_equal(objects.label, [0] * 8 + [1] * 4)
     np.testing.assert_array_equal(objects.valid, [1, 1, 1, 0, 1, 1, 1, 0, 1, 1, 1, 1])

@@ -23,7 +23,7 @@ KITTI_CALIBRATION = CALIBRATION.replace("300", "721.5377")
 
 
 def seen(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """The test of SPEC 1.3 as it is written there."""
+    """KITTI's crop by projection: depth from 0.001 to 100 m and pixels strictly inside the image."""
     width, height = camera.image_size
     a, b, d = lidar_to_image(camera.calibration) @ np.vstack([points[:, :3].T.astype(np.float64), np.ones(len(points))])
     with np.errstate(divide="ignore"):
@@ -180,7 +180,7 @@ def test_cropping_gives_the_reduced_clouds_point_for_point(shared: Path) -> None
 
 
 @pytest.mark.reference
-def test_the_crop_is_the_spec_s_test(shared: Path) -> None:
+def test_the_crop_is_the_projected_test(shared: Path) -> None:
     for path in sorted((shared / "kitti_full/training/velodyne").glob("*.bin")):
         points = read_points(path)
         camera = read_camera(path.parents[1] / f"calib/{path.stem}.txt", path.parents[1] / f"image_2/{path.stem}.png")
@@ -212,7 +212,7 @@ def test_labels_return_from_the_lidar_frame_to_the_image(shared: Path) -> None:
 
 
 def camera_corners(row: ObjectRow) -> np.ndarray:
-    """Corners of SPEC 11.1, step 2."""
+    """Corners of a row's box in the camera frame."""
     height, width, length = row.dimensions
     cos, sin = np.cos(row.rotation_y), np.sin(row.rotation_y)
     corners = [

@@ -1,4 +1,4 @@
-"""The loader: what a batch holds, that (seed, position) is all that it depends on, and how it fails."""
+"""The loader: the content of batches, their dependence on (seed, position) alone, and failures."""
 
 import multiprocessing
 import os
@@ -31,7 +31,7 @@ from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import InputError
 
 CONFIG = replace(tiny(), data=replace(tiny().data, max_points=1024, max_gt_sampling_points=512))
-# Over the end of an epoch with three frames, and in the middle of it.
+# With three frames, batches start at the beginning and in the middle of an epoch.
 BATCH = 2
 
 
@@ -167,7 +167,9 @@ def test_workers_change_nothing_and_resume_each_other(mini, expected: list[Scene
 
 @pytest.mark.parametrize("change", [{"seed": 4}, {"batch_size": 3}, {"database": None}])
 def test_a_state_of_another_stream_is_refused(mini, change: dict) -> None:
-    with pytest.raises(ValueError, match=r"^The loader's state is of another stream \(\w+ \d+ instead of \d+\); resume"):
+    with pytest.raises(
+        ValueError, match=r"^The loader's state is of another stream \(\w+ \d+ instead of \d+\); resume"
+    ):
         make(mini, **change).set_state(make(mini).state)
     fewer = replace(mini[0], names=NAMES[:2])
     with pytest.raises(ValueError, match=r"frames 3 instead of 2, checksum \d+ instead"):
@@ -177,7 +179,7 @@ def test_a_state_of_another_stream_is_refused(mini, change: dict) -> None:
 
 
 def test_processes_share_the_same_batches(mini) -> None:
-    """The host's part alone: the shares in turn are the rows of the whole batch."""
+    """The shares of the processes, concatenated, are the rows of the whole batch."""
     stream = Stream(*mini[:1], CONFIG, 3, True, mini[1])
     whole, shares = Rows(stream, 4), [Rows(stream, 4, (index, 2)) for index in range(2)]
     for batch in range(3):
@@ -239,7 +241,7 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize("what", ["leave", "wait"])
 def test_workers_end_with_their_parent_however_it_ends(mini, tmp_path: Path, what: str) -> None:
-    """In silence where the loader was not closed; and after a SIGKILL, as the output, which they share, ends."""
+    """Silently if the loader was not closed; after a SIGKILL too, as the end of the shared output shows."""
     (tmp_path / "script.py").write_text(SCRIPT)
     command = [sys.executable, tmp_path / "script.py", mini[1].path.parent, what]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as parent:
@@ -274,7 +276,7 @@ def test_an_empty_data_set_is_refused(mini) -> None:
 
 @pytest.mark.reference
 def test_real_frames_fit(shared: Path) -> None:
-    """Nothing of the reference data's frames is over the capacities of the CPU's preset."""
+    """No frame of the reference data exceeds the capacities of the CPU's preset."""
     config: Config = car_lite()
     dataset = open_dataset(shared / "kitti", "val")
     scenes = [pad_frame(dataset.read(index), index, config) for index in range(len(dataset))]

@@ -1,4 +1,4 @@
-"""Which frames a split names: the official lists, split files, and frames that are not there."""
+"""The frames of a split: the official lists, split files, and frames that do not exist."""
 
 import hashlib
 from pathlib import Path
@@ -10,7 +10,7 @@ from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.splits import official_split
 from ciassd_jax.formats.errors import InputError
 
-# SPEC 1.5.
+# Chen et al.'s split.
 CHECKSUMS = {
     "train": "e85ce0142be11c7e4196fd7b79a8bc8c2cefdd6fe754ac61fef8d421e37aba5c",
     "val": "6e2394d97c866c3af1ffb049f828abdf3d5b707d9575d16885fd0de87b72b0c8",

@@ -58,7 +58,7 @@ def lidar_frame(points: list[int], score: float = 0.5) -> tuple[LabelledObjects,
 
 
 def test_without_a_camera() -> None:
-    """Difficulty is as given, no detection is too low, and the image has no say."""
+    """Difficulty is as given, no detection is too low, and image boxes are not used."""
     truth, detected = lidar_frame([3, 10, 30, 60, 200])
     evaluation = evaluate([truth], [detected])
     assert not evaluation.has_camera

@@ -1,4 +1,4 @@
-"""What the check of a data set finds, and that it finds nothing in sound data."""
+"""The findings of the check of a data set, and none in sound data."""
 
 import re
 from collections.abc import Callable
@@ -214,7 +214,7 @@ def test_the_official_list_where_frames_are_missing(tmp_path: Path) -> None:
 
 
 def swap(root: Path, count: int) -> None:
-    """Swap length and width of the cars of so many frames."""
+    """Swap length and width of the cars of the first `count` frames."""
     for name in NAMES[:count]:
         path = root / f"training/label_2/{name}.txt"
         rows = read_rows(path)

@@ -574,12 +574,12 @@ def test_files_of_other_kinds(tmp_path: Path) -> None:
     refused(tmp_path, "directory")
     for raw, word in [
         (b"", "empty"),
-        (b"hello world", "no PyTorch weights file"),
-        (b"\x00" * 100, "no PyTorch weights file"),
+        (b"hello world", "not a PyTorch weights file"),
+        (b"\x00" * 100, "not a PyTorch weights file"),
         (b"PK\x03\x04", "damaged"),
-        (pickle.dumps({"a": 1}), "no PyTorch weights file"),
-        (pickle.dumps(0x1950A86A20F9469CFC6C, 2) + pickle.dumps(1002, 2), "no PyTorch weights file"),
-        (b"\x93NUMPY\x01\x00", "no PyTorch weights file"),
+        (pickle.dumps({"a": 1}), "not a PyTorch weights file"),
+        (pickle.dumps(0x1950A86A20F9469CFC6C, 2) + pickle.dumps(1002, 2), "not a PyTorch weights file"),
+        (b"\x93NUMPY\x01\x00", "not a PyTorch weights file"),
     ]:
         path.write_bytes(raw)
         refused(path, word)

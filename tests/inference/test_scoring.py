@@ -1,4 +1,4 @@
-"""A detector over a data set: what is evaluated, what is written, and what is summed over the frames."""
+"""Scoring of a detector on a data set: evaluation, written files, and summed warnings."""
 
 import re
 import shutil
@@ -25,12 +25,12 @@ from ciassd_jax.inference.scoring import detect_dataset, find_trained, score_dat
 from ciassd_jax.simulation import Lidar, open_synthetic
 
 Detect = Callable[[np.ndarray], tuple[np.ndarray, tuple[str, ...]]]
-# Four decimals of metres and pixels move an overlap past its limit, or join two scores, only now and then.
+# Rounding to four decimals rarely moves an overlap past its limit or merges two scores.
 ROUNDING = 0.05
 
 
 class Oracle(Detector):
-    """Finds what it is told to find, with falling scores."""
+    """Returns given boxes with descending scores."""
 
     def __init__(self, detect: Detect) -> None:
         self._find = detect
@@ -56,7 +56,7 @@ def nothing(points: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
 
 
 def blurred_truth(dataset: Dataset, seed: int = 0) -> Oracle:
-    """The labels in their order, each a little beside its place, and one box more a frame."""
+    """The labels in their order, slightly shifted, and one more box per frame."""
     rng, frames = np.random.default_rng(seed), iter(map(dataset.read, range(len(dataset))))
 
     def find(points: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -68,7 +68,7 @@ def blurred_truth(dataset: Dataset, seed: int = 0) -> Oracle:
 
 
 def written(evaluated: list[Any], labels: Path, folder: Path) -> Evaluation:
-    """The evaluation of what is read again from files."""
+    """The evaluation of the written files."""
     write_frames(evaluated, folder)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Frames of .* without a result file", FormatWarning)
