@@ -1,4 +1,4 @@
-"""`python -m ciassd_jax` is the program `ciassd`, which finds what it compiled in its next run again."""
+"""`python -m ciassd_jax` is the program `ciassd`; it keeps compiled programs for its next run."""
 
 import os
 import sys
@@ -10,9 +10,9 @@ from ciassd_jax.cli import main
 
 
 def keep_programs() -> None:
-    """Keep what is compiled in ~/.cache/ciassd_jax, so that the next process need not compile it.
+    """Use a persistent compilation cache, ~/.cache/ciassd_jax, so that later runs skip the compilation.
 
-    JAX_COMPILATION_CACHE_DIR moves it, JAX_ENABLE_COMPILATION_CACHE=false keeps none.
+    JAX_COMPILATION_CACHE_DIR sets another folder; JAX_ENABLE_COMPILATION_CACHE=false disables the cache.
     """
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -20,7 +20,7 @@ def keep_programs() -> None:
 
 
 def program() -> int:
-    """Run the program."""
+    """Run `ciassd` with the compilation cache and return its exit code."""
     keep_programs()
     return main()
 

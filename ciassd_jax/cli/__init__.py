@@ -1,49 +1,93 @@
-"""The program `ciassd`: every sub-command is a thin call of public functions.
+"""The program `ciassd`: every command is a thin call of public functions.
 
-Exit codes: 0 good, 1 failed check, 2 bad usage or input (one sentence on stderr says what and the remedy).
+Exit codes: 0 success, 1 failed check, 2 bad usage or input (one sentence on stderr gives the reason and the remedy).
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
 
-from ciassd_jax.cli.data import Data, Submit
-from ciassd_jax.cli.evaluate import Evaluate
-from ciassd_jax.cli.inference import Convert, Demo, Info, Predict
-from ciassd_jax.cli.messages import UsageError
+from ciassd_jax.cli.convert import Convert
+from ciassd_jax.cli.data_check import Check
+from ciassd_jax.cli.data_prepare import Prepare
+from ciassd_jax.cli.data_synth import Synth
+from ciassd_jax.cli.demo import Demo
+from ciassd_jax.cli.eval import Evaluate
+from ciassd_jax.cli.info import Info
+from ciassd_jax.cli.messages import UsageError, describe, silenced
+from ciassd_jax.cli.predict import Predict
+from ciassd_jax.cli.renamed import check_names
+from ciassd_jax.cli.submit import Submit
 from ciassd_jax.cli.train import Train
 from ciassd_jax.cli.view import View
 from ciassd_jax.formats.errors import InputError
 
+
+@dataclass(frozen=True)
+class Data:
+    """Check, prepare or simulate a data set."""
+
+    action: Annotated[
+        Annotated[Check, tyro.conf.subcommand("check", prefix_name=False)]
+        | Annotated[Prepare, tyro.conf.subcommand("prepare", prefix_name=False)]
+        | Annotated[Synth, tyro.conf.subcommand("synth", prefix_name=False)],
+        tyro.conf.arg(name=""),
+    ]
+
+    def run(self) -> int:
+        return self.action.run()
+
+
 Command = (
-    Annotated[Predict, tyro.conf.subcommand("predict")]
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Predict, tyro.conf.subcommand("predict")]
+    | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[tyro.conf.OmitSubcommandPrefixes[Evaluate], tyro.conf.subcommand("eval")]
+    | Annotated[Submit, tyro.conf.subcommand("submit")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Info, tyro.conf.subcommand("info")]
-    | Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[tyro.conf.OmitSubcommandPrefixes[Evaluate], tyro.conf.subcommand("eval")]
-    | Annotated[Data, tyro.conf.subcommand("data")]
-    | Annotated[Submit, tyro.conf.subcommand("submit")]
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; returns the exit code."""
-    command = tyro.cli(Command, prog="ciassd", args=arguments, description="LiDAR 3D object detection in JAX.")
+    """Run the program and return its exit code."""
+    with silenced("absl", "asyncio"):
+        code = _run(sys.argv[1:] if arguments is None else arguments)
+        if code:
+            # What a failed checkpoint left behind complains when it is collected.
+            gc.collect()
+        return code
+
+
+def _run(arguments: Sequence[str]) -> int:
     try:
-        code = command.run()
+        check_names(arguments)
+        code = _parse(arguments).run()
         sys.stdout.flush()
         return code
     except (InputError, UsageError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {describe(error)}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        # Whoever read the output, such as `head`, has seen enough; nothing more can be said there.
+        # The reader of the output, such as `head`, has closed it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def _parse(arguments: Sequence[str]) -> Command:
+    return tyro.cli(
+        Command,
+        prog="ciassd",
+        args=arguments,
+        description="LiDAR 3D object detection in JAX.",
+        config=(tyro.conf.DisallowNone, tyro.conf.PositionalMetavarFromFieldName),
+    )

@@ -1,48 +1,77 @@
-"""`ciassd demo`: from points to pictures, on simulated streets or on a cloud of the user's."""
+"""`ciassd demo`: from points to pictures, on simulated streets or on a cloud of one's own."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
+
+from ciassd_jax.cli.messages import UsageError, warnings_as_lines
+from ciassd_jax.cli.options import load_as, open_simulated
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.formats.writing import check_folder, replacing
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.results import write_json
-from ciassd_jax.inference.weights import Weights
-from ciassd_jax.simulation import open_synthetic
+from ciassd_jax.view.bev import plot_bev
+from ciassd_jax.view.html import view_html
 from ciassd_jax.view.view_frame import ViewFrame, frame_to_view
 
 
-def run_demo(file: Path | None, weights: Weights, out: Path, *, scenes: int, seed: int) -> None:
-    """Detect in `file`, or in so many simulated scenes; print what is found, write JSON and pictures to `out`."""
-    check_folder(out)
-    frames = [ViewFrame(file.stem, read_points(file))] if file is not None else simulated_frames(scenes, seed)
-    detector = Detector(weights.variables, weights.config)
-    print("Compiling the detector; what is compiled once is kept for the next run.", flush=True)
-    detector.compile(max(len(frame.points) for frame in frames))
-    shown, written = [], []
-    for frame in frames:
-        result = detector.detect(frame.points)
-        cars = f", {len(frame.truth)} objects in its label" if file is None else ""
-        print(f"\n{frame.name}: {len(frame.points)} points{cars}\n{result}", flush=True)
-        shown.append(result.show_in(frame))
-        written.append(write_json(out / f"{frame.name}.json", result))
-    print()
-    for draw in (_pictures, _page):
-        written += _drawn(draw, shown, out)
-    print("Wrote " + ", ".join(map(str, written)) + ".")
+@dataclass(frozen=True)
+class Demo:
+    """Run the whole pipeline on simulated streets or on a file, and write results, pictures and a 3D page."""
+
+    file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")] = None
+    """A cloud of your own instead of simulated ones."""
+    weights: Path = Path("car_lite")
+    """Weights file, or the name of bundled weights; the bundled ones were trained on simulated streets alone."""
+    out: Path = Path("ciassd_demo")
+    """Folder for the results."""
+    scenes: int = 3
+    """Number of streets to simulate."""
+    seed: int = 0
+    """Seed of the streets."""
+
+    def run(self) -> int:
+        if self.scenes < 1:
+            raise UsageError(f"--scenes {self.scenes} shows nothing; ask for at least 1.")
+        with warnings_as_lines(self.file or "simulated street"):
+            weights = load_as(self.weights, None)
+            check_folder(self.out)
+            frames = self._frames()
+            detector = Detector(weights.variables, weights.config)
+            print("Compiling the detector; the compiled program is kept for the next run.", flush=True)
+            detector.compile(max(len(frame.points) for frame in frames))
+            written, shown = [], []
+            for frame in frames:
+                result = detector.detect(frame.points)
+                objects = "" if self.file else f", {len(frame.truth)} labelled objects"
+                print(f"\n{frame.name}: {len(frame.points)} points{objects}\n{result}", flush=True)
+                shown.append(result.show_in(frame))
+                written.append(write_json(self.out / f"{frame.name}.json", result))
+            print()
+            for draw in (_draw_pictures, _draw_page):
+                written += _try_to_draw(draw, shown, self.out)
+        print("Wrote " + ", ".join(map(str, written)) + ".")
+        return 0
+
+    def _frames(self) -> list[ViewFrame]:
+        """The file's points, or simulated scenes with their labels as the camera sees them."""
+        if self.file is not None:
+            return [ViewFrame(self.file.stem, read_points(self.file))]
+        print(f"Simulating {self.scenes} streets, scanned by a LiDAR with 64 beams.", flush=True)
+        dataset = open_simulated("all", self.scenes, self.seed)
+        return [frame_to_view(dataset.read(index))._replace(name=f"street_{index}") for index in range(self.scenes)]
 
 
-def simulated_frames(number: int, seed: int) -> list[ViewFrame]:
-    """Scenes with their ground truth, as the camera's view shows them."""
-    print(f"Simulating {number} streets as a LiDAR with 64 beams sees them.", flush=True)
-    dataset = open_synthetic(seed, number)
-    return [frame_to_view(dataset.read(index))._replace(name=f"street_{index}") for index in range(number)]
+Draw = Callable[[Sequence[ViewFrame], Path], list[Path]]
 
 
-def _drawn(draw: Callable[[Sequence[ViewFrame], Path], list[Path]], frames: list[ViewFrame], out: Path) -> list[Path]:
-    """What was drawn; nothing, and a sentence that says what is missing, without the extra for pictures."""
+def _try_to_draw(draw: Draw, frames: Sequence[ViewFrame], out: Path) -> list[Path]:
+    """Return what was written; without the libraries for it print what to install and return nothing."""
     try:
         return draw(frames, out)
     except ModuleNotFoundError as error:
@@ -50,9 +79,8 @@ def _drawn(draw: Callable[[Sequence[ViewFrame], Path], list[Path]], frames: list
         return []
 
 
-def _pictures(frames: Sequence[ViewFrame], out: Path) -> list[Path]:
-    from ciassd_jax.view.bev import plot_bev
-
+def _draw_pictures(frames: Sequence[ViewFrame], out: Path) -> list[Path]:
+    """A picture from above of every frame."""
     paths = [out / f"{frame.name}.png" for frame in frames]
     for frame, path in zip(frames, paths, strict=True):
         truth = frame.truth if len(frame.truth) else None
@@ -62,7 +90,6 @@ def _pictures(frames: Sequence[ViewFrame], out: Path) -> list[Path]:
     return paths
 
 
-def _page(frames: Sequence[ViewFrame], out: Path) -> list[Path]:
-    from ciassd_jax.view.html import view_html
-
+def _draw_page(frames: Sequence[ViewFrame], out: Path) -> list[Path]:
+    """One 3D page of all frames."""
     return [view_html(frames, title="ciassd demo").save(out / "view.html")]

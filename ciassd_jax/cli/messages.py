@@ -1,7 +1,8 @@
-"""What the program says on stderr: one sentence for an error, one line for a warning."""
+"""What the program prints on stderr: one sentence for an error, one line for a warning, a progress bar."""
 
 from __future__ import annotations
 
+import logging
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,21 +10,55 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from ciassd_jax.formats.errors import FormatWarning
+from ciassd_jax.formats.errors import DroppedWarning, FormatWarning
 
 Item = TypeVar("Item")
+# How the library's messages name what the program has an option or a command for.
+_OPTIONS = {
+    "`image_size` (width, height)": "--image-size WIDTH HEIGHT",
+    "`overwrite`": "--overwrite",
+    "`write_synthetic`": "`ciassd data synth`",
+}
 
 
 class UsageError(ValueError):
-    """An option cannot be used; the message is one sentence that says what would be valid."""
+    """An option cannot be used; the message is one sentence with the remedy."""
+
+
+@contextmanager
+def values_from_options() -> Iterator[None]:
+    """Turn a ValueError into a UsageError: the refused values are those of the options."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def describe(error: Exception) -> str:
+    """Return an error's sentence with the options of the program in place of the arguments of the library."""
+    text = str(error)
+    for argument, option in _OPTIONS.items():
+        text = text.replace(argument, option)
+    return text
+
+
+@contextmanager
+def silenced(*loggers: str) -> Iterator[None]:
+    """Keep libraries from logging pages of traces where the package reports the failure in one sentence."""
+    levels = {logging.getLogger(name): logging.getLogger(name).level for name in loggers}
+    for logger in levels:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in levels.items():
+            logger.setLevel(level)
 
 
 @contextmanager
 def warnings_as_lines(source: Path | str) -> Iterator[None]:
-    """Show our own warnings as one line that names the input; leave all others as they are."""
+    """Print the package's own warnings as one line that names the input; leave all others as they are."""
     from tqdm.auto import tqdm
-
-    from ciassd_jax.formats.errors import DroppedWarning
 
     def show(message, category, *rest, **more):  # type: ignore[no-untyped-def]
         if issubclass(category, DroppedWarning | FormatWarning):
@@ -41,7 +76,7 @@ def warnings_as_lines(source: Path | str) -> Iterator[None]:
 
 
 def frames_with_bar(items: Sequence[Item]) -> Iterable[Item]:
-    """The items, with a progress bar where a terminal shows it."""
+    """Return the items with a progress bar, which only a terminal shows."""
     from tqdm.auto import tqdm
 
     return tqdm(items, unit="frame", leave=False, disable=None)

@@ -1,0 +1,124 @@
+"""`ciassd eval`: average precision by KITTI's rules, of a network or of result files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ciassd_jax.cli.messages import UsageError, warnings_as_lines
+from ciassd_jax.cli.options import Frames, Preset, Unset, load_as, override
+from ciassd_jax.evaluation import Evaluation, evaluate, format_json, format_report, read_folders
+from ciassd_jax.formats.writing import check_folder, write_text
+from ciassd_jax.inference.detector import Detector
+from ciassd_jax.inference.scoring import Scored, detect_dataset, find_trained, score_frames, write_frames
+
+
+@dataclass(frozen=True)
+class Text:
+    """Evaluate a folder of result files; this starts no device."""
+
+    labels: Annotated[Path, tyro.conf.Positional]
+    """Folder of label files NNNNNN.txt, such as training/label_2."""
+    results: Annotated[Path, tyro.conf.Positional]
+    """Folder of result files with the same names; frames without a result file are not evaluated."""
+    json: Unset[Path] = None
+    """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
+
+    def run(self) -> int:
+        if self.json is not None:
+            check_folder(self.json.parent)
+        with warnings_as_lines(self.results):
+            truths, detections = read_folders(self.labels, self.results)
+        evaluation = evaluate(truths, detections)
+        if self.json is not None:
+            write_text(self.json, format_json(evaluation))
+        print(format_report(evaluation))
+        if self.json is not None:
+            print(f"Wrote {self.json}.")
+        return 0
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compute average precision (AP) by KITTI's rules, in 2D, bird's-eye view and 3D, and of the orientation.
+
+    Of a network: `ciassd eval --weights FILE`. Of a folder of result files: `ciassd eval txt LABELS RESULTS`.
+    """
+
+    data_set: Annotated[Frames, tyro.conf.OmitArgPrefixes] = field(default_factory=Frames)
+    weights: Unset[Path] = None
+    """Weights file (.safetensors, or a released .pth), or the name of bundled weights."""
+    workdir: Unset[Path] = None
+    """Or the folder of a training, whose best weights are evaluated."""
+    split: str = "val"
+    """The frames to evaluate: train, val, trainval, all or a file of ImageSets."""
+    seed: int = 0
+    """Seed of simulated frames."""
+    out: Unset[Path] = None
+    """Folder for the detections of every frame (NAME.txt), result.json and table.log."""
+    json: Unset[Path] = None
+    """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
+    preset: Unset[Preset] = None
+    """Use the config of this preset instead of the one in the weights file; the parameters must fit."""
+    score_threshold: Unset[float] = None
+    """Lowest class probability of a candidate."""
+    files: Annotated[
+        Annotated[Text, tyro.conf.subcommand("txt")] | None,
+        tyro.conf.arg(name="", help="Instead of a network:"),
+    ] = None
+
+    def run(self) -> int:
+        if self.files is None:
+            return self._network()
+        if replace(self, files=None) != Evaluate():
+            raise UsageError("`ciassd eval txt` has one option, --json, after LABELS RESULTS; leave out the others.")
+        return self.files.run()
+
+    def _network(self) -> int:
+        weights = load_as(self._weights(), self.preset)
+        config = override(weights.config, score_threshold=self.score_threshold)
+        folder = self.data_set.find_folder()
+        for out in (self.out, self.json and self.json.parent):
+            if out is not None:
+                check_folder(out)
+        with warnings_as_lines(folder or "simulated frames"):
+            dataset = self.data_set.open(self.split, self.seed)
+            frames = detect_dataset(Detector(weights.variables, config), dataset, _with_bar)
+        evaluation = score_frames(frames)
+        print(format_report(evaluation))
+        boxes, seconds = sum(len(frame.lines) for frame in frames), sum(frame.result.seconds for frame in frames)
+        milliseconds = f"{1e3 * seconds / len(frames):.0f} ms per frame"
+        print(f"\n{len(frames)} frames, {boxes} boxes, {milliseconds} without reading and compilation.")
+        self._write(frames, evaluation)
+        return 0
+
+    def _weights(self) -> Path:
+        if self.weights is not None and self.workdir is None:
+            return self.weights
+        if self.workdir is not None and self.weights is None:
+            return find_trained(self.workdir)
+        raise UsageError(
+            "Give either --weights FILE or --workdir FOLDER, or compare files with `ciassd eval txt LABELS RESULTS`."
+        )
+
+    def _write(self, frames: Sequence[Scored], evaluation: Evaluation) -> None:
+        if self.out is not None:
+            write_frames(frames, self.out)
+            write_text(self.out / "result.json", format_json(evaluation))
+            # Named .txt, the table would look like the results of a frame.
+            write_text(self.out / "table.log", format_report(evaluation))
+        if self.json is not None:
+            write_text(self.json, format_json(evaluation))
+        written = [str(path) for path in (self.out, self.json) if path is not None]
+        if written:
+            print(f"Wrote {' and '.join(written)}.")
+
+
+def _with_bar(names: Sequence[str]) -> Iterable[str]:
+    from tqdm.auto import tqdm
+
+    return tqdm(names, unit="frame")

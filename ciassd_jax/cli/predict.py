@@ -1,0 +1,87 @@
+"""`ciassd predict`: detections of one cloud, or of a folder of clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ciassd_jax.cli.messages import warnings_as_lines
+from ciassd_jax.cli.options import Dtype, ImageSize, Preset, Unset, load_as, override
+from ciassd_jax.data.clouds import CloudFile, find_clouds
+from ciassd_jax.formats.kitti_camera import frustum_of
+from ciassd_jax.formats.points import read_points
+from ciassd_jax.formats.writing import check_folder
+from ciassd_jax.inference.detector import Detector
+from ciassd_jax.inference.results import FrameResult, write_result
+
+
+@dataclass(frozen=True)
+class Predict:
+    """Detect objects in a cloud or a folder of clouds.
+
+    Writes OUT/NAME.json for every cloud, and KITTI's rows as OUT/NAME.txt if it has a calibration.
+    """
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A .bin, .npy, .npz or .pcd file, or a folder of such files."""
+    weights: Path
+    """Weights file (.safetensors, or a released .pth), or the name of bundled weights."""
+    out: Path
+    """Folder for the results."""
+    calib: Unset[Path] = None
+    """Calibration file, or a folder of them; found without this option in KITTI's layout."""
+    image_size: ImageSize = None
+    preset: Unset[Preset] = None
+    """Use the config of this preset instead of the one in the weights file; the parameters must fit."""
+    dtype: Unset[Dtype] = None
+    """Compute type of the network."""
+    score_threshold: Unset[float] = None
+    """Lowest class probability of a candidate."""
+
+    def run(self) -> int:
+        clouds = find_clouds(self.path, calib=self.calib, image_size=self.image_size)
+        weights = load_as(self.weights, self.preset)
+        config = override(weights.config, dtype=self.dtype, score_threshold=self.score_threshold)
+        check_folder(self.out)
+        detector = Detector(weights.variables, config)
+        if self.path.is_dir():
+            self._folder(detector, clouds)
+        else:
+            result, written = self._cloud(detector, clouds[0])
+            print(f"{self.path}: {_table(result)}")
+            print(f"Wrote {' and '.join(map(str, written))}.")
+        return 0
+
+    def _cloud(self, detector: Detector, cloud: CloudFile) -> tuple[FrameResult, list[Path]]:
+        with warnings_as_lines(cloud.cloud):
+            result = detector.detect(read_points(cloud.cloud), frustum=frustum_of(cloud.camera))
+            return result, write_result(result, cloud.cloud.stem, self.out, cloud.camera)
+
+    def _folder(self, detector: Detector, clouds: Sequence[CloudFile]) -> None:
+        from tqdm.auto import tqdm
+
+        boxes, seconds = 0, 0.0
+        with tqdm(clouds, unit="frame") as bar:
+            for cloud in bar:
+                result, _ = self._cloud(detector, cloud)
+                best = f"best {result.scores.max():.2f}" if len(result) else "none"
+                bar.write(f"{cloud.cloud.name}: {len(result)} boxes, {best}, {result.seconds:.3f} s")
+                boxes, seconds = boxes + len(result), seconds + result.seconds
+        print(
+            f"{len(clouds)} frames, {boxes} boxes, {seconds / len(clouds):.3f} s per frame without reading and "
+            f"compilation; results are in {self.out}."
+        )
+
+
+def _table(result: FrameResult) -> str:
+    """The number of detections and a row for each."""
+    rows = [f"{len(result)} detections in {1e3 * result.seconds:.0f} ms"]
+    if len(result):
+        rows.append("  class       score       x       y       z  length   width  height     yaw")
+    for label, score, box in zip(result.labels, result.scores, result.boxes, strict=True):
+        rows.append(f"  {label:<10} {score:>6.3f} " + " ".join(f"{value:>7.2f}" for value in box))
+    return "\n".join(rows)
