@@ -6,6 +6,15 @@ layout. Both call `simulate`, the pure function from a random key to a cloud and
 
 from ciassd_jax.simulation.sensor import Lidar
 from ciassd_jax.simulation.street_folder import make_frames, write_synthetic
-from ciassd_jax.simulation.streets import frame_key, make_frame, open_synthetic, simulate
+from ciassd_jax.simulation.streets import frame_key, make_frame, open_synthetic, simulate, split_synthetic
 
-__all__ = ["Lidar", "frame_key", "make_frame", "make_frames", "open_synthetic", "simulate", "write_synthetic"]
+__all__ = [
+    "Lidar",
+    "frame_key",
+    "make_frame",
+    "make_frames",
+    "open_synthetic",
+    "simulate",
+    "split_synthetic",
+    "write_synthetic",
+]

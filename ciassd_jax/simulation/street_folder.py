@@ -22,14 +22,12 @@ from ciassd_jax.formats.points import write_bin
 from ciassd_jax.formats.writing import check_folder, replacing, write_text
 from ciassd_jax.ops.camera import project
 from ciassd_jax.simulation.sensor import Lidar
-from ciassd_jax.simulation.streets import frame_name, make_frame
+from ciassd_jax.simulation.streets import make_frame, split_synthetic
 from ciassd_jax.simulation.virtual_camera import calibration_text, virtual_camera
 
 # Marks folders that `write_synthetic` wrote, so that nothing else is ever overwritten.
 MARK = "synthetic.txt"
 _PARTS = ("training", "ImageSets", MARK)
-# Every fourth frame belongs to the split val.
-_VALIDATION = 4
 # A depth image shows this range of depths in metres; a point is a square of this many pixels.
 _DEPTHS, _DOT = (3.0, 80.0), 3
 
@@ -45,20 +43,18 @@ def write_synthetic(
 ) -> int:
     """Write frames 0 to `frames` - 1 of a seed as OUT/training and OUT/ImageSets; returns the sum of `dropped` pairs.
 
-    Frames 3, 7, 11, ... form the split val, the others the split train. `overwrite` replaces what this function wrote
-    there before. `track` wraps the iteration over the frames, for a progress bar. Raises InputError for a folder that
-    cannot be used, and without pillow.
+    The splits are those of `split_synthetic`. `overwrite` replaces what this function wrote there before. `track` wraps
+    the iteration over the frames, for a progress bar. Raises InputError for a folder that cannot be used, and without
+    pillow.
     """
     folder = Path(out)
     _require_pillow()
     _clear(folder, overwrite)
     write_text(folder / MARK, f"{frames} synthetic frames of seed {seed}, written by `ciassd data synth`")
-    names = [frame_name(index) for index in range(frames)]
-    validation = names[_VALIDATION - 1 :: _VALIDATION]
-    training = [name for name in names if name not in validation]
-    for split, some in (("train", training), ("val", validation), ("trainval", names)):
+    splits = split_synthetic(frames)
+    for split in ("train", "val", "trainval"):
         with replacing(folder / "ImageSets" / f"{split}.txt") as temporary:
-            temporary.write_text("".join(f"{name}\n" for name in some))
+            temporary.write_text("".join(f"{name}\n" for name in splits[split]))
     made = make_frames(seed, range(frames), lidar)
     total = 0
     for _ in track(range(frames)):

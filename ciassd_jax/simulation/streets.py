@@ -46,11 +46,6 @@ def frame_key(seed: int, index: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), index)
 
 
-def frame_name(index: int) -> str:
-    """Return the name of a frame, six digits as in KITTI."""
-    return f"{index:06d}"
-
-
 def simulate(key: jax.Array, lidar: Lidar) -> Simulated:
     """Draw one scene and scan it. Use `vmap` for a batch of keys; `frame_key` returns that of a frame."""
     for_world, for_scan = jax.random.split(key)
@@ -85,7 +80,7 @@ def make_frame(seed: int, index: int, lidar: Lidar | None = None) -> tuple[Frame
     camera = virtual_camera()
     rows = label_rows(boxes, kind, through, arriving, camera)
     points = simulated.cloud.points[: simulated.cloud.count]
-    return kitti_frame(frame_name(index), points, tuple(rows), camera), int(simulated.dropped)
+    return kitti_frame(f"{index:06d}", points, tuple(rows), camera), int(simulated.dropped)
 
 
 def open_synthetic(seed: int, frames: int, lidar: Lidar | None = None) -> Dataset:
@@ -93,8 +88,14 @@ def open_synthetic(seed: int, frames: int, lidar: Lidar | None = None) -> Datase
 
     Except for the rounding of the label's text, its frames are those that `write_synthetic` writes for the same seed.
     """
-    names = tuple(map(frame_name, range(frames)))
-    return Dataset(names, partial(read_synthetic_frame, seed=seed, lidar=lidar or Lidar()))
+    return Dataset(split_synthetic(frames)["all"], partial(read_synthetic_frame, seed=seed, lidar=lidar or Lidar()))
+
+
+def split_synthetic(frames: int) -> dict[str, tuple[str, ...]]:
+    """Return the names of synthetic frames by split: 3, 7, 11, ... are val, the others train, and both are trainval."""
+    names = tuple(f"{index:06d}" for index in range(frames))
+    training = tuple(name for index, name in enumerate(names) if index % 4 != 3)
+    return {"train": training, "val": names[3::4], "trainval": names, "all": names}
 
 
 def read_synthetic_frame(name: str, *, seed: int, lidar: Lidar) -> Frame:

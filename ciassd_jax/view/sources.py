@@ -1,4 +1,4 @@
-"""Frames to look at from files: clouds, folders of them and data sets, with labels, images and saved detections."""
+"""Frames to view from files: clouds, folders of clouds and data sets, with labels, images and saved detections."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ciassd_jax.data.clouds import CloudFile, find_beside, find_clouds
-from ciassd_jax.data.folders import is_custom, open_dataset
-from ciassd_jax.data.frames import clean_points
-from ciassd_jax.data.kitti import IMAGE, kitti_folder
-from ciassd_jax.formats.custom_rows import CustomRow, parse_custom_row, read_custom_rows
+from ciassd_jax.data.folders import is_custom, is_kitti, open_dataset
+from ciassd_jax.data.frames import Dataset, clean_points
+from ciassd_jax.data.kitti import IMAGE, kitti_folder, kitti_frame
+from ciassd_jax.formats.custom_rows import parse_custom_row, read_custom_rows
 from ciassd_jax.formats.errors import FormatWarning, InputError, read_bytes
 from ciassd_jax.formats.kitti_boxes import rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera
@@ -24,32 +24,31 @@ from ciassd_jax.formats.kitti_rows import DONT_CARE, read_labels, read_rows
 from ciassd_jax.formats.lines import read_lines
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.view.view_frame import ViewFrame, frame_to_view
+from ciassd_jax.view.viz_extra import require
 
-# Folders of clouds, and where their labels lie beside them: KITTI's and OpenPCDet's custom layout.
+# Folders of clouds, and the folders beside them with their labels: KITTI's and OpenPCDet's custom layout.
 _LABELS = {"velodyne": "label_2", "velodyne_reduced": "label_2", "points": "labels"}
 
 
 class Source(NamedTuple):
-    """A frame that can be read, and the file of its image where there is one."""
+    """A frame that can be read, and the file of its image if it exists."""
 
     read: Callable[[], ViewFrame]
     image: Path | None
 
 
 def find_sources(path: Path, split: str = "all", image_size: tuple[int, int] | None = None) -> dict[str, Source]:
-    """The frames at `path` by name: of a file of points, of a folder of such files, or of a split of a data set.
+    """Return the frames at `path` by name.
 
-    A data set is a folder in KITTI's layout, whose clouds are cropped to the camera's view, or in OpenPCDet's custom
-    layout. Clouds of a folder are shown whole; labels and images in such a layout beside it belong to them.
-    Raises InputError, one sentence with the remedy, for a path that is none of these.
+    `path` is a file of points, a folder of such files, or a data set, of which `split` selects the frames. A data set
+    in KITTI's layout has clouds cropped to the camera's view; the other layout is OpenPCDet's custom one. Clouds of a
+    folder are shown whole, with the labels and images beside them. `image_size` (width, height) overrides that of
+    KITTI's images. Raises InputError, one sentence with the remedy, for any other path.
     """
-    if any((path / part).is_dir() for part in ("training", "testing", "points")):
-        dataset = open_dataset(path, split, image_size)
-        folder = None if is_custom(path) else kitti_folder(path, split)[0]
-        return {
-            name: Source(partial(_read_labelled, dataset.read_frame, name), _existing(folder, IMAGE.format(name)))
-            for name in dataset.names
-        }
+    if is_custom(path):
+        return dataset_sources(open_dataset(path, split))
+    if is_kitti(path):
+        return dataset_sources(open_dataset(path, split, image_size), kitti_folder(path, split)[0])
     inside = next((path / name for name in _LABELS if (path / name).is_dir()), None)
     if inside:
         raise InputError(f"{path} is part of a data set; name {path.parent} for the whole, or {inside} for its clouds.")
@@ -60,18 +59,32 @@ def find_sources(path: Path, split: str = "all", image_size: tuple[int, int] | N
     }
 
 
+def dataset_sources(dataset: Dataset, folder: Path | None = None) -> dict[str, Source]:
+    """Return the frames of a data set by name; `folder` is that of a KITTI split, for the images."""
+
+    def read(name: str) -> ViewFrame:
+        return frame_to_view(dataset.read_frame(name))
+
+    return {name: Source(partial(read, name), _existing(folder, IMAGE.format(name))) for name in dataset.names}
+
+
 def read_source(source: Source, *, image: bool = False) -> ViewFrame:
-    """Read a frame, with its image where one is wanted and there; InputError for a file that cannot be used."""
+    """Read a frame, with its image if `image` is true and the file exists.
+
+    Raises InputError for a file that cannot be used.
+    """
     frame = source.read()
     return frame._replace(image=read_image(source.image)) if image and source.image else frame
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Read an image's colours; InputError if it is none."""
-    try:
-        from PIL import Image, UnidentifiedImageError
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("Images need pillow; get it with `pip install 'ciassd_jax[viz]'`.") from error
+    """Read the colours of an image.
+
+    Raises InputError if the file is not an image, and ModuleNotFoundError without pillow.
+    """
+    require("Images", "PIL")
+    from PIL import Image, UnidentifiedImageError
+
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
@@ -80,10 +93,10 @@ def read_image(path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
 
 
 def add_saved(frame: ViewFrame, folder: Path) -> ViewFrame | None:
-    """The frame with the detections that `folder` holds for it: NAME.json, else NAME.txt; None if it has neither.
+    """Return the frame with its detections saved in `folder` as NAME.json, else as NAME.txt; None without either.
 
-    JSON is what `ciassd predict` writes. Rows are KITTI's, or without a camera those of `ciassd eval`: x, y, z, length,
-    width, height, yaw, class, score. Raises InputError for a file that is neither.
+    JSON is as written by `inference.results.write_result`. Rows of text are KITTI's; for a frame without a camera they
+    are x, y, z, length, width, height, yaw, class, score. Raises InputError for a file in another format.
     """
     path = _existing(folder, f"{frame.name}.json") or _existing(folder, f"{frame.name}.txt")
     if path is None:
@@ -100,28 +113,20 @@ def add_saved(frame: ViewFrame, folder: Path) -> ViewFrame | None:
 _Saved = tuple[np.ndarray, np.ndarray, tuple[str, ...]]
 
 
-def _read_labelled(read_frame: Callable, name: str) -> ViewFrame:
-    return frame_to_view(read_frame(name))
-
-
 def _read_cloud(file: CloudFile) -> ViewFrame:
-    """A cloud as it is, with the objects of the label file beside it."""
-    points = clean_points(read_points(file.cloud), file.cloud)
-    frame = ViewFrame(file.cloud.stem, points, camera=file.camera)
-    kind = _LABELS.get(file.cloud.absolute().parent.name)
-    path = find_beside(file.cloud, kind, ".txt") if kind else None
-    if path is None:
-        return frame
-    if kind == "labels":
-        rows: list[CustomRow] = read_custom_rows(path)
+    """A whole cloud, with the objects of the label file beside it."""
+    name, points = file.cloud.stem, clean_points(read_points(file.cloud), file.cloud)
+    folder = _LABELS.get(file.cloud.absolute().parent.name)
+    path = find_beside(file.cloud, folder, ".txt") if folder else None
+    if path is not None and folder == "labels":
+        rows = read_custom_rows(path)
         boxes = np.array([row.box for row in rows], np.float64).reshape(-1, 7)
-        return frame._replace(truth=boxes, truth_labels=tuple(row.type for row in rows))
-    if file.camera is None:
-        warnings.warn(f"{path} is not shown, as {file.cloud} has no calibration.", FormatWarning, stacklevel=3)
-        return frame
-    objects = [row for row in read_labels(path) if row.type != DONT_CARE]
-    boxes = np.asarray(rows_to_boxes(objects, file.camera.calibration).to_array())
-    return frame._replace(truth=boxes, truth_labels=tuple(row.type for row in objects))
+        return ViewFrame(name, points, truth=boxes, truth_labels=tuple(row.type for row in rows))
+    if path is not None and file.camera is not None:
+        return frame_to_view(kitti_frame(name, points, tuple(read_labels(path)), file.camera))
+    if path is not None:
+        warnings.warn(f"{path} is not shown, because {file.cloud} has no calibration.", FormatWarning, stacklevel=3)
+    return ViewFrame(name, points, camera=file.camera)
 
 
 def _read_json(path: Path) -> _Saved:
@@ -133,14 +138,14 @@ def _read_json(path: Path) -> _Saved:
     except (ValueError, TypeError, LookupError):
         fits = False
     if not fits:
-        raise InputError(f"{path} holds no detections as `ciassd predict` writes them; write it again.")
+        raise InputError(f"{path} does not hold detections with boxes, scores and labels; write it again.")
     return boxes, scores, labels
 
 
 def _read_kitti(path: Path, camera: Camera) -> _Saved:
     rows = [row for row in read_rows(path) if row.type != DONT_CARE]
     if any(row.score is None for row in rows):
-        raise InputError(f"{path} has rows without a score, so they are no detections; name the folder of results.")
+        raise InputError(f"{path} has rows without a score, which are not detections; name the folder of results.")
     scores = np.array([row.score for row in rows], np.float64)
     return np.asarray(rows_to_boxes(rows, camera.calibration).to_array()), scores, tuple(row.type for row in rows)
 

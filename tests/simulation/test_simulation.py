@@ -1,4 +1,4 @@
-"""The LiDAR simulator: rays against known shapes, labels against what hides them, frames against their files."""
+"""The LiDAR simulator: rays against known shapes, labels against occlusion, frames against their files."""
 
 from functools import cache
 from pathlib import Path
@@ -13,11 +13,19 @@ from ciassd_jax import tiny
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.scenes import pad_frame
 from ciassd_jax.evaluation.dataset_check import check_dataset
-from ciassd_jax.formats.errors import InputError
+from ciassd_jax.formats.errors import DroppedWarning, InputError
 from ciassd_jax.formats.kitti_camera import read_calibration
 from ciassd_jax.formats.kitti_rows import read_rows
 from ciassd_jax.ops.footprints import points_in_boxes
-from ciassd_jax.simulation import Lidar, frame_key, make_frame, open_synthetic, simulate, write_synthetic
+from ciassd_jax.simulation import (
+    Lidar,
+    frame_key,
+    make_frame,
+    open_synthetic,
+    simulate,
+    split_synthetic,
+    write_synthetic,
+)
 from ciassd_jax.simulation.casting import Rays
 from ciassd_jax.simulation.ground import Ground, cast_ground, ground_height
 from ciassd_jax.simulation.label_rows import label_rows
@@ -114,7 +122,7 @@ def test_faces_lean() -> None:
 
 
 def test_tiles_lose_nothing() -> None:
-    """Every ray tried with every solid of a street finds the same as the rays of the tiles alone."""
+    """Testing every ray against every solid of a street finds the same hits as the pairs of tiles."""
     solids = jax.tree.map(lambda leaf: leaf[small_world().solids.present], small_world().solids)
     # Rays stop at the surface of a wall.
     solids = solids._replace(material=np.full_like(solids.material, WALL))
@@ -187,7 +195,7 @@ def test_sloping_ground_with_kerbs_is_met_on_its_surface() -> None:
     ],
 )
 def test_objects_fill_their_boxes(kind: int, size: tuple[float, float, float]) -> None:
-    """Every solid stays within its object's box, and together they reach its faces, whatever the style."""
+    """For any style, the solids of an object stay inside its box and together reach its faces."""
     build = build_person if kind in (PEDESTRIAN, CYCLIST) else build_vehicle
     length, width, height = size
     for style in np.random.default_rng(0).uniform(size=(8, NUM_STYLES)).astype(np.float32):
@@ -220,7 +228,7 @@ def test_points_of_objects_lie_in_their_boxes() -> None:
 
 
 def street_with(more: Solids) -> World:
-    """A car 15 m ahead on flat ground, and something else."""
+    """A car 15 m ahead on flat ground, and one more solid."""
     size = np.float32([4.0, 1.7, 1.5])
     parts = build_vehicle(size, np.int32(CAR), np.full(NUM_STYLES, 0.5, np.float32))
     car = place(parts, np.float32([15.0, 0.0, -1.73]), np.float32(0))
@@ -299,9 +307,16 @@ def test_a_cloud_is_what_a_lidar_gives() -> None:
     assert points[:, 3].max() <= 1
     distance = np.linalg.norm(points[:, :3], axis=1)
     assert distance.max() < SMALL.max_range + 0.1
-    # The roof of the car that carries the sensor shades what lies close before and behind it.
+    # The roof of the car that carries the sensor hides the ground close to it.
     flat = np.hypot(points[:, 0], points[:, 1])
     assert flat[(points[:, 0] > 0) & (abs(points[:, 1]) < 0.3)].min() > 4.4
+
+
+def test_a_warning_counts_pairs_over_capacity(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, _ = make_frame(0, 7, SMALL)
+    monkeypatch.setattr("ciassd_jax.simulation.streets.make_frame", lambda *_: (frame, 3))
+    with pytest.warns(DroppedWarning, match="000007.* 3 pairs"):
+        open_synthetic(0, 8, SMALL).read(7)
 
 
 def test_scenes_can_be_batched() -> None:
@@ -317,6 +332,8 @@ def test_a_folder_gives_back_the_frames(tmp_path: Path) -> None:
     assert files.names == direct.names == ("000000", "000001", "000002", "000003", "000004")
     assert open_dataset(tmp_path / "five", "val").names == ("000003",)
     assert open_dataset(tmp_path / "five", "train").names == ("000000", "000001", "000002", "000004")
+    splits = {split: open_dataset(tmp_path / "five", split).names for split in ("train", "val", "trainval", "all")}
+    assert splits == split_synthetic(5)
     for index in range(5):
         read, made = files.read(index), direct.read(index)
         np.testing.assert_array_equal(read.points, made.points)

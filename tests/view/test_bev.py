@@ -1,4 +1,4 @@
-"""The bird's-eye view: what is drawn, where, and without any global state."""
+"""The bird's-eye view: what is drawn and where, without global state."""
 
 import subprocess
 import sys

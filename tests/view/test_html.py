@@ -1,4 +1,4 @@
-"""The page as a file: its data, its notes, and that it refers to nothing outside itself."""
+"""The page as a file: its data, its notes, and no reference to anything outside."""
 
 import base64
 import html

@@ -1,4 +1,4 @@
-"""Boxes as lines: their places in space, their projection, and what is cut at the camera's plane."""
+"""Boxes as lines: their positions, their projection, and clipping at the camera's plane."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_ends_before_the_camera_project_by_the_matrix() -> None:
 def test_an_edge_through_the_cameras_plane_is_cut_there() -> None:
     line = np.array([[[-4.0, 1, -1], [8, 2, -1]]])
     ((start, end),) = project_segments(line, PROJECTION)
-    # The point of the line that is nearest to the camera and still before it.
+    # The point of the line at the nearest depth.
     share = (NEAREST_DEPTH + 4) / 12
     cut = line[0, 0] + share * (line[0, 1] - line[0, 0])
     np.testing.assert_allclose(cut[0], NEAREST_DEPTH)

@@ -1,4 +1,4 @@
-"""Boxes in a camera's image: what is drawn, where, and on KITTI's own images."""
+"""Boxes in a camera's image: what is drawn and where, also on KITTI's images."""
 
 from pathlib import Path
 

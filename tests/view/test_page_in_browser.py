@@ -1,6 +1,6 @@
-"""The page in a real browser: it draws, nothing fails or is fetched, and its controls do what they say.
+"""The page in a real browser: it draws without errors and requests, and its controls work.
 
-Needs Chromium (Debian: apt-get install -y chromium); skipped where there is none.
+Needs Chromium (Debian: apt-get install -y chromium); skipped without it.
 """
 
 import json
@@ -23,13 +23,16 @@ from ciassd_jax.view.sources import read_image
 from ciassd_jax.view.view_frame import ViewFrame
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (apt-get install -y chromium)")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (apt-get install -y chromium)"),
+]
 
 BOXES = np.array([[10, 2, -1, 4, 2, 1.5, 0.3], [14, -3, -1, 4, 2, 1.5, 2.0], [18, 5, -1, 4, 2, 1.5, -1.0]])
 SCORES = np.array([0.9, 0.5, 0.2])
 LABELS = ("Car", "<b>Van</b>", "Car")
 EVIL = "</script><b>second</b>"
-# Before anything else of the page: whatever fails is kept, and pictures follow the clock, as there is no screen.
+# Runs first: records every failure, and lets animation frames follow the clock, as there is no screen.
 LISTEN = """<script>
   window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 16);
   window.cancelAnimationFrame = clearTimeout;
@@ -39,7 +42,7 @@ LISTEN = """<script>
   addEventListener("unhandledrejection", (event) => failures.push(String(event.reason)));
   addEventListener("securitypolicyviolation", (event) => failures.push(event.violatedDirective + event.blockedURI));
 </script>"""
-# What a hand would do, and what the page then shows, written into the document for --dump-dom.
+# Operates the controls and writes what the page then shows into the document, for --dump-dom.
 ACT = """<script>
   const settled = () => new Promise((done) => setTimeout(done, 200));
   function look() {
@@ -89,7 +92,7 @@ ACT = """<script>
 
 
 def browse(page: Path, folder: Path, *arguments: str, budget: int = 4000) -> "subprocess.CompletedProcess[str]":
-    """Open a page in headless Chromium, without a GPU and without any network."""
+    """Open a page in headless Chromium, without GPU and network."""
     assert CHROMIUM is not None
     command = [CHROMIUM, "--headless", "--no-sandbox", f"--user-data-dir={folder / 'profile'}", "--no-first-run"]
     command += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
@@ -121,7 +124,7 @@ def make_page(folder: Path) -> Page:
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the page showed after each step of `ACT`."""
+    """What the page shows after each step of `ACT`."""
     folder = tmp_path_factory.mktemp("browser")
     text = make_page(folder).html.replace("<head>", "<head>" + LISTEN, 1)
     head, tail = text.rsplit("</body>", 1)
@@ -132,7 +135,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def asked_of_network(folder: Path) -> list[str]:
-    """Who, of all but the browser itself, asked the network for something."""
+    """Initiators of network requests, without the browser itself."""
     log = (folder / "net.json").read_text(errors="replace")
     return [who for who in re.findall(r'"initiator":"([^"]*)"', log) if who != "not an origin"]
 
@@ -192,7 +195,7 @@ def test_frames_are_stepped_through_and_keep_the_settings(seen: dict[str, Any]) 
     following, back = seen["next"], seen["back"]
     assert (following["name"], following["picture"], following["points"]) == (EVIL, False, 5999)
     assert following["note"] == "1 of 6,000 points are not finite and not shown."
-    # Boxes without a score are none that a score could hide.
+    # The slider does not hide boxes without a score.
     assert following["found"] == "1"
     assert (back["name"], back["found"], back["truth"], back["note"]) == ("first", "2 of 3", "0 of 2", "")
     assert {state["bold"] for state in (seen["first"], following)} == {0}

@@ -1,4 +1,4 @@
-"""What is shown of a large or spoilt cloud."""
+"""What is shown of a large or damaged cloud."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def test_thinning_takes_one_of_each_part(count: int, most: int) -> None:
 
 
 def test_thinning_takes_all_rings_of_an_organised_cloud() -> None:
-    """Rings that alternate from point to point: a stride of 64 would show one of 64."""
+    """The ring changes from point to point: a stride of 64 would show 1 ring of 64."""
     rings = np.arange(64 * 2000) % 64
     assert np.bincount(rings[thin(len(rings), 2000)], minlength=64).min() > 10
 

@@ -1,4 +1,4 @@
-"""Frames and scenes as what a page shows."""
+"""Frames and scenes as the records that a page shows."""
 
 import jax
 import numpy as np
