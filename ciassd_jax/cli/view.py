@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -13,14 +12,13 @@ import tyro
 
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
 from ciassd_jax.cli.options import SIMULATED, ImageSize, Unset, load_as, open_simulated
-from ciassd_jax.data.frames import Dataset
 from ciassd_jax.formats.errors import FormatWarning, InputError
 from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.view.html import view_html
-from ciassd_jax.view.sources import Source, add_saved, find_sources, read_source
-from ciassd_jax.view.view_frame import ViewFrame, frame_to_view
+from ciassd_jax.view.sources import Source, add_saved, dataset_sources, find_sources, read_source
+from ciassd_jax.view.view_frame import ViewFrame
 from ciassd_jax.view.viz_extra import require
 
 
@@ -62,7 +60,7 @@ class View:
 
     def _check(self) -> None:
         try:
-            require("plotly", "PIL")
+            require("Pages", "plotly", "PIL")
         except ModuleNotFoundError as error:
             raise UsageError(str(error)) from error
         if self.weights and self.results:
@@ -89,8 +87,7 @@ class View:
     def _sources(self) -> dict[str, Source]:
         if self.path != SIMULATED:
             return find_sources(Path(self.path), self.split, self.image_size)
-        dataset = open_simulated(self.split, self.frames, self.seed)
-        return {name: Source(partial(_read_labelled, dataset, name), None) for name in dataset.names}
+        return dataset_sources(open_simulated(self.split, self.frames, self.seed))
 
     def _choose(self, sources: dict[str, Source]) -> dict[str, Source]:
         """The named frames, or the first ones; prints how many there are if not all are shown."""
@@ -103,10 +100,6 @@ class View:
         if len(sources) > self.frames:
             print(f"Showing the first {self.frames} of {len(sources)} frames; --frames shows more, --names others.")
         return dict(list(sources.items())[: self.frames])
-
-
-def _read_labelled(dataset: Dataset, name: str) -> ViewFrame:
-    return frame_to_view(dataset.read_frame(name))
 
 
 def _detect(detector: Detector, frame: ViewFrame) -> ViewFrame:
