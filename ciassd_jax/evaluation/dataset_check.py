@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ from ciassd_jax.data.kitti import crop_without_images, read_kitti_frame
 from ciassd_jax.data.splits import ALL, Places, find_file, listed_names, missing_files, repeated_names
 from ciassd_jax.evaluation.kitti_ap import LIMITS, METRICS, Metric, possible_precision
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_rows
+from ciassd_jax.evaluation.overlap import image_overlap
 from ciassd_jax.evaluation.summary import evaluate
 from ciassd_jax.formats.custom_rows import CustomRow
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike
@@ -82,14 +84,6 @@ class LabelScore(NamedTuple):
     possible: tuple[float, ...]
 
 
-class _Objects(NamedTuple):
-    """The objects of one type: rows, boxes, and numbers of points inside."""
-
-    rows: tuple[ObjectRow | CustomRow, ...]
-    boxes: Float[np.ndarray, "G 7"]
-    inside: Int[np.ndarray, " G"]
-
-
 class Report(NamedTuple):
     """The check of a data set; `types` are in descending order of their numbers of objects."""
 
@@ -138,12 +132,9 @@ def check_dataset(
         findings += _check_frame(frame, inside, cloud)
         count, voxels = len(frame.points), _count_voxels(frame.points, config.grid)
         frames.append(Checked(frame._replace(points=np.zeros((0, 4), np.float32)), count, inside, voxels))
-    types, scores = _by_type(frames), _score_labels([one.frame for one in frames])
-    for name, objects in types.items():
-        findings += _check_type(name, objects, config)
-    findings += [*_check_amounts(frames, config), *_check_scores(scores)]
-    summaries = {name: _summarise(objects, config.grid) for name, objects in types.items()}
-    return Report(tuple(findings), tuple(frames), summaries, tuple(scores))
+    (found, types), scores = _check_types(frames, config), _score_labels([one.frame for one in frames])
+    findings += [*found, *_check_amounts(frames, config), *_check_scores(scores)]
+    return Report(tuple(findings), tuple(frames), types, tuple(scores))
 
 
 def _read(read: Callable[..., Frame], findings: list[Finding]) -> Frame:
@@ -217,7 +208,7 @@ def _check_row(row: ObjectRow | CustomRow, size: Float[np.ndarray, 3]) -> Iterat
 def _check_projection(frame: Frame) -> Iterator[Finding]:
     """Compare the image boxes of fully visible objects with the projections of their boxes."""
     pairs = [(row, seen) for row, seen in _projected(frame) if row.truncated == 0 and row.occluded == 0]
-    overlap = float(np.median([_image_overlap(row.bbox, seen.bbox) if seen else 0.0 for row, seen in pairs] or [1.0]))
+    overlap = float(np.median([image_overlap(row.bbox, seen.bbox) if seen else 0.0 for row, seen in pairs] or [1.0]))
     if overlap < _SAME:
         text = f"the boxes project elsewhere than their image boxes lie (overlap {overlap:.2f})"
         place = f"{pairs[0][0].place} and others"
@@ -233,26 +224,23 @@ def _projected(frame: Frame) -> list[tuple[ObjectRow, ObjectRow | None]]:
     return [(row, seen.get(index)) for index, row in enumerate(rows)]
 
 
-def _image_overlap(a: Sequence[float], b: Sequence[float]) -> float:
-    """Return the intersection over union of two image boxes (x1, y1, x2, y2); 0 if one of them is empty."""
-    shared = math.prod(max(min(a[i + 2], b[i + 2]) - max(a[i], b[i]), 0) for i in (0, 1))
-    areas = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (a, b))
-    return shared / (areas - shared) if shared else 0.0
+def _check_types(frames: Sequence[Checked], config: Config) -> tuple[list[Finding], dict[str, TypeSummary]]:
+    """Check and summarise the objects of each type together, the most frequent type first."""
+    types = np.array([name for one in frames for name in one.frame.names], np.str_)
+    places = np.array([row.place for one in frames for row in one.frame.objects], np.str_)
+    boxes = np.concatenate([np.zeros((0, 7)), *(one.frame.boxes.to_array() for one in frames)])
+    inside = np.concatenate([np.zeros(0, np.int64), *(one.inside for one in frames)])
+    findings: list[Finding] = []
+    summaries = {}
+    for name, _ in Counter(types.tolist()).most_common():
+        mine = types == name
+        findings += _check_type(name, places[mine], boxes[mine], config)
+        summaries[name] = _summarise(boxes[mine], inside[mine], config.grid)
+    return findings, summaries
 
 
-def _by_type(frames: Sequence[Checked]) -> dict[str, _Objects]:
-    """Return the objects of each type, the most frequent first."""
-    found: dict[str, list[tuple]] = {}
-    for one in frames:
-        for labelled in zip(one.frame.objects, np.asarray(one.frame.boxes.to_array()), one.inside, strict=True):
-            found.setdefault(labelled[0].type, []).append(labelled)
-    columns = {name: zip(*found[name], strict=True) for name in sorted(found, key=lambda name: -len(found[name]))}
-    return {name: _Objects(next(column), *map(np.array, column)) for name, column in columns.items()}
-
-
-def _check_type(name: str, objects: _Objects, config: Config) -> Iterator[Finding]:
+def _check_type(name: str, places: np.ndarray, boxes: Float[np.ndarray, "G 7"], config: Config) -> Iterator[Finding]:
     """Check the objects of a type together: length and width swapped, heights."""
-    places, boxes = [row.place for row in objects.rows], objects.boxes
     ratio = boxes[:, 3] / np.where(boxes[:, 4] > 0, boxes[:, 4], np.inf)
     if len(boxes) >= _FEW and np.median(ratio) < _WIDE:
         text = f"{(ratio < 1).sum()} of {len(boxes)} objects of type {name} are wider than long"
@@ -274,11 +262,11 @@ def _check_type(name: str, objects: _Objects, config: Config) -> Iterator[Findin
             yield Finding("height", False, f"{places[0]} and others: {text}; {remedy}")
 
 
-def _summarise(objects: _Objects, grid: GridConfig) -> TypeSummary:
-    center = objects.boxes[:, :3]
+def _summarise(boxes: Float[np.ndarray, "G 7"], inside: Int[np.ndarray, " G"], grid: GridConfig) -> TypeSummary:
+    center = boxes[:, :3]
     outside = ((center < np.array(grid.minimum)) | (center > np.array(grid.maximum))).any(-1)
-    z, length, width, height = np.median(objects.boxes[:, 2:6], axis=0).tolist()
-    return TypeSummary(len(center), int(outside.sum()), int((objects.inside == 0).sum()), (length, width, height), z)
+    z, length, width, height = np.median(boxes[:, 2:6], axis=0).tolist()
+    return TypeSummary(len(center), int(outside.sum()), int((inside == 0).sum()), (length, width, height), z)
 
 
 def _count_voxels(points: Float[np.ndarray, "P 4"], grid: GridConfig) -> int:
@@ -290,11 +278,10 @@ def _count_voxels(points: Float[np.ndarray, "P 4"], grid: GridConfig) -> int:
 
 def _check_amounts(frames: Sequence[Checked], config: Config) -> Iterator[Finding]:
     """Find boxes that mostly hold no point, clouds far smaller than usual, and frames over a capacity."""
-    inside = np.concatenate([np.zeros(0, np.int64), *(one.inside for one in frames)])
-    empty = int((inside == 0).sum())
-    if empty > len(inside) / 2:
+    inside = [count for one in frames for count in one.inside.tolist()]
+    if inside.count(0) > len(inside) / 2:
         remedy = "check that labels, calibration and clouds belong together, and the axes of the boxes."
-        yield Finding("no point", True, f"{empty} of {len(inside)} boxes hold no point; {remedy}")
+        yield Finding("no point", True, f"{inside.count(0)} of {len(inside)} boxes hold no point; {remedy}")
     usual = float(np.median([one.points for one in frames] or [0]))
     for one in frames:
         if 0 < one.points < _SPARSE * usual:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -55,6 +57,13 @@ def intersect(a: FlatObjects, b: FlatObjects) -> dict[Geometry, Intersections]:
         "bev": _shared_only(first, second, np.asarray(footprint), area[first], other_area[second]),
         "3d": _shared_only(first, second, np.asarray(footprint * height), size[first], other_size[second]),
     }
+
+
+def image_overlap(a: Sequence[float], b: Sequence[float]) -> float:
+    """Return the intersection over union of two image boxes (x1, y1, x2, y2); 0 if one of them is empty."""
+    shared = math.prod(max(min(a[i + 2], b[i + 2]) - max(a[i], b[i]), 0) for i in (0, 1))
+    areas = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (a, b))
+    return shared / (areas - shared) if shared else 0.0
 
 
 def _pairs(

@@ -167,9 +167,8 @@ def test_workers_change_nothing_and_resume_each_other(mini, expected: list[Scene
 
 @pytest.mark.parametrize("change", [{"seed": 4}, {"batch_size": 3}, {"database": None}])
 def test_a_state_of_another_stream_is_refused(mini, change: dict) -> None:
-    with pytest.raises(
-        ValueError, match=r"^The loader's state is of another stream \(\w+ \d+ instead of \d+\); resume"
-    ):
+    message = r"^The loader's state is of another stream \(\w+ \d+ instead of \d+\); resume"
+    with pytest.raises(ValueError, match=message):
         make(mini, **change).set_state(make(mini).state)
     fewer = replace(mini[0], names=NAMES[:2])
     with pytest.raises(ValueError, match=r"frames 3 instead of 2, checksum \d+ instead"):
