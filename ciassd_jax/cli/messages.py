@@ -15,7 +15,7 @@ from ciassd_jax.formats.errors import DroppedWarning, FormatWarning
 Item = TypeVar("Item")
 # How the library's messages name what the program has an option or a command for.
 _OPTIONS = {
-    "`image_size` (width, height)": "--image-size WIDTH HEIGHT",
+    "as `image_size` (width, height)": "with --image-size WIDTH HEIGHT",
     "`overwrite`": "--overwrite",
     "`write_synthetic`": "`ciassd data synth`",
 }

@@ -35,8 +35,8 @@ class Train:
 
     SIGTERM and Ctrl-C save the state after the running step and end the program with the shell's exit codes (143, 130).
 
-    Several processes train together if each runs the same command with --coordinator, --num-processes and its own
-    --process-index. SLURM and TPU pods need none of the three.
+    Several processes train together if each runs the same command with its own --process-index besides --coordinator
+    and --num-processes. SLURM and TPU pods need none of the three.
     """
 
     workdir: Path

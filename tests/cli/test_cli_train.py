@@ -1,33 +1,28 @@
-"""`ciassd train`, called in this process: it trains, goes on, and says in one sentence what it cannot use."""
+"""`ciassd train`, called in this process: it trains, resumes, and answers what it cannot use with one sentence."""
 
 import json
+import logging
 import os
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from cli_files import Run
+from mini_folders import write_split
 from mini_training import STEPS, mini_config, share_training_programs, write_data
-from small import random_variables
+from small import random_variables, share_programs
 
-from ciassd_jax import create_train_state, load_weights, save_weights
+from ciassd_jax import create_train_state, load_weights, make_batches, open_dataset, save_weights
 from ciassd_jax.cli import main
 from ciassd_jax.config.presets import PRESETS
-from ciassd_jax.data.gt_sampling import database_path
-from ciassd_jax.training import loop
+from ciassd_jax.data.gt_sampling import database_path, find_database
+from ciassd_jax.training.checkpoint import Checkpoints
 from ciassd_jax.training.loop import Fitted
-
-# One program of training and one of evaluation serve the whole file.
-_PROGRAMS: dict[Any, Any] = {}
-_compile = loop._Run._compile
-
-
-class Run(NamedTuple):
-    code: int
-    out: str
-    err: str
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +41,7 @@ def run(root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Monk
         return Run(code, *capsys.readouterr())
 
     share_training_programs(monkeypatch)
+    share_programs(monkeypatch)
     monkeypatch.setitem(PRESETS, "tiny", mini_config)
     return call
 
@@ -54,34 +50,58 @@ def steps_of(workdir: Path) -> list[int]:
     return [json.loads(line)["step"] for line in (workdir / "metrics.jsonl").read_text().splitlines()]
 
 
-def test_trains_and_goes_on(run: Callable[..., Run], root: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_trains_and_resumes(run: Callable[..., Run], root: Path, tmp_path: Path) -> None:
     first = run(workdir=tmp_path, **{"log-every": 2})
     assert first.code == 0, first.err
-    assert f"Collecting the objects for ground-truth sampling from 3 frames into {tmp_path}" in first.out
+    assert f"from 3 frames into {tmp_path}" in first.out
     assert not database_path(root, "train").exists()
     assert f"Trained 9 steps. Weights, metrics and evaluations are in {tmp_path}." in first.out
     assert steps_of(tmp_path) == [2, 4, 6, 8, 9]
     saved = load_weights(tmp_path / "last.safetensors").variables
     again = run(workdir=tmp_path, **{"log-every": 2})
     assert again.code == 0
-    assert "Going on from step 9 in " in again.out
-    assert "Collecting" not in again.out
+    assert "step 9 in " in again.out
+    assert "from 3 frames" not in again.out
     jax.tree.map(np.testing.assert_array_equal, load_weights(tmp_path / "last.safetensors").variables, saved)
 
 
-def test_another_config_or_seed_is_one_sentence(run: Callable[..., Run], tmp_path: Path) -> None:
-    assert run(workdir=tmp_path).code == 0
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+@pytest.fixture
+def begun(root: Path, tmp_path: Path) -> Path:
+    """The folder of a training with one checkpoint."""
+    config, dataset = mini_config(), open_dataset(root, "train")
+    database = find_database(dataset, [database_path(tmp_path, "train")], log=lambda text: None)
+    state = create_train_state(jax.random.key(0), config, variables=random_variables(config))
+    with (
+        make_batches(dataset, config, seed=0, batch_size=2, database=database) as batches,
+        Checkpoints(tmp_path / "checkpoints", config) as checkpoints,
+    ):
+        checkpoints.save(state, batches.state)
+    return tmp_path
+
+
+def test_another_config_or_seed_is_one_sentence(run: Callable[..., Run], begun: Path) -> None:
+    before = {path: path.read_bytes() for path in begun.rglob("*") if path.is_file()}
     for options, words in (
         ({"weight-decay": 0.5}, "config.schedule.weight_decay is 0.01 there and 0.5 here"),
         ({"seed": 7}, "seed 0 instead of 7"),
     ):
-        refused = run(workdir=tmp_path, **options)
+        refused = run(workdir=begun, **options)
         assert refused.code == 2
         assert words in refused.err
         assert refused.err.startswith("error: ")
         assert refused.err.count("\n") == 1
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert {path: path.read_bytes() for path in begun.rglob("*") if path.is_file()} == before
+
+
+def test_damaged_checkpoints_are_one_sentence(run: Callable[..., Run], begun: Path) -> None:
+    for path in (begun / "checkpoints").rglob("d/*"):
+        path.write_bytes(b"")
+    levels = [logging.getLogger(name).level for name in ("absl", "asyncio")]
+    refused = run(workdir=begun)
+    assert refused.code == 2
+    assert re.fullmatch(rf"error: .*{begun}/checkpoints .*\n", refused.err)
+    assert [logging.getLogger(name).level for name in ("absl", "asyncio")] == levels
 
 
 @pytest.fixture
@@ -94,7 +114,7 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
         variables = random_variables(config)
         return Fitted(create_train_state(jax.random.key(0), config, variables=variables), None, None)
 
-    monkeypatch.setattr(fitting, "fit", stand_in)
+    monkeypatch.setattr("ciassd_jax.cli.train.fit", stand_in)
     return calls
 
 
@@ -127,19 +147,49 @@ def test_options_go_to_the_config(run: Callable[..., Run], fits: list[tuple[Any,
     assert (stream.seed, stream.augmented) == (4, True)
 
 
+def test_simulated_frames_need_no_folder(
+    run: Callable[..., Run], fits: list[tuple[Any, ...]], streets: list[tuple[int, int]], tmp_path: Path
+) -> None:
+    done = run(workdir=tmp_path, data="simulated", frames=8, seed=5, **{"evaluate-every": 1})
+    assert done.code == 0, done.err
+    ((_, stream, options),) = fits
+    assert (stream.dataset.names, options["validation"].names) == (
+        ("000000", "000001", "000002", "000004", "000005", "000006"),
+        ("000003", "000007"),
+    )
+    assert (stream.seed, set(streets)) == (5, {(5, 8)})
+    assert database_path(tmp_path, "train").is_file()
+
+
+@pytest.mark.parametrize("word", ["none", "None"])
+def test_no_validation(word: str, run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path) -> None:
+    assert run(workdir=tmp_path, validate=word, **{"evaluate-every": 1}).code == 0
+    ((_, _, options),) = fits
+    assert options["validation"] is None
+
+
+def test_fields_of_the_schedule_are_replaced(
+    run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path
+) -> None:
+    assert run("--remat", workdir=tmp_path, **{"gradient-accumulation-steps": 3, "ema-decay": 0.5}).code == 0
+    ((config, _, _),) = fits
+    schedule = mini_config().schedule
+    assert config.schedule == replace(schedule, remat=True, gradient_accumulation_steps=3, ema_decay=0.5)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"steps": 0}, "total_steps"),
         ({"steps": 3, "epochs": 2}, "either --steps or --epochs"),
         ({"workers": -1}, "workers"),
-        ({"seed": -1}, "seed is -1"),
+        ({"seed": -1}, "seed"),
         ({"log-every": 0}, "must be at least 1"),
         ({"learning-rate": 0}, "learning_rate must be positive"),
         ({"overfit-one": "000777"}, "Frame 000777 is not among the 3 of train"),
         ({"split": "none"}, "none"),
         ({"data": "nowhere"}, "nowhere"),
-        ({"init-from": "nowhere.safetensors"}, "is no file"),
+        ({"init-from": "nowhere.safetensors"}, "nowhere.safetensors"),
         ({"num-processes": 2}, "give all three"),
     ],
 )
@@ -180,7 +230,7 @@ def test_a_read_only_workdir_is_one_sentence(
     [
         (9, "nan", "000004.txt, line 1: a value is not finite"),
         (8, "-1.5", "Frame 000004: object 0 (Car) has the size"),
-        (0, "Lorry", "000004.txt: the type 'Lorry' is none of KITTI's"),
+        (0, "Lorry", "'Lorry'"),
     ],
 )
 def test_a_label_that_is_none_names_its_frame(
@@ -191,7 +241,10 @@ def test_a_label_that_is_none_names_its_frame(
     fields = label.read_text().split(" ")
     fields[column] = value
     label.write_text(" ".join(fields))
-    refused = run(workdir=tmp_path / "w", data=data)
+    # Alone, so that no other frame is augmented before it, and from weights: both need no compilation.
+    write_split(data, "one", "000004")
+    save_weights(tmp_path / "start.safetensors", random_variables(mini_config()), mini_config())
+    refused = run(workdir=tmp_path / "w", data=data, split="one", **{"init-from": tmp_path / "start.safetensors"})
     assert refused.code == 2
     assert words in refused.err
     assert refused.err.startswith("error: ")

@@ -69,7 +69,7 @@ def test_a_cloud_alone(view: Any, tmp_path: Path) -> None:
     (frame,) = result.frames
     assert (frame["name"], num_points(frame), frame["truth"]["boxes"], frame["image"]) == ("street", 600, [], None)
     assert re.fullmatch(
-        r"Wrote view.html: 1 frame, 0 true and 0 detected boxes, \d\.\d MB; open it in a browser\.\n", result.out
+        r"Wrote view.html: 1 frame, 0 labelled and 0 detected boxes, \d\.\d MB; open it in a browser\.\n", result.out
     )
 
 
@@ -89,7 +89,7 @@ def test_a_kitti_folder_shows_its_labels(view: Any, tmp_path: Path) -> None:
         np.testing.assert_allclose(frame["truth"]["boxes"], TRUTH, atol=2e-3)
         assert frame["truth"]["labels"] == list(OBJECTS)
         assert frame["image"] is None
-    assert "3 frames, 9 true and 0 detected boxes" in result.out
+    assert "3 frames, 9 labelled and 0 detected boxes" in result.out
 
 
 def test_a_folder_of_clouds_within_kitti_is_shown_whole_with_its_labels(view: Any, tmp_path: Path) -> None:
@@ -109,13 +109,23 @@ def test_a_custom_data_set_shows_its_labels(part: str, view: Any, tmp_path: Path
 
 def test_frames_are_chosen_by_name_number_and_split(view: Any, tmp_path: Path) -> None:
     root = write_kitti(tmp_path / "kitti")
-    assert [frame["name"] for frame in view(root, "--frames", NAMES[2], NAMES[0]).frames] == [NAMES[2], NAMES[0]]
-    result = view(root, "--most", 2)
+    assert [frame["name"] for frame in view(root, "--names", NAMES[2], NAMES[0]).frames] == [NAMES[2], NAMES[0]]
+    result = view(root, "--frames", 2)
     assert [frame["name"] for frame in result.frames] == list(NAMES[:2])
-    assert "Showing the first 2 of 3 frames; --frames names others, --most shows more." in result.out
+    assert "Showing the first 2 of 3 frames; " in result.out
     (root / "ImageSets").mkdir()
     (root / "ImageSets" / "few.txt").write_text(NAMES[1])
     assert [frame["name"] for frame in view(root, "--split", "few").frames] == [NAMES[1]]
+
+
+def test_simulated_frames_need_no_folder(view: Any, streets: list[tuple[int, int]]) -> None:
+    result = view("simulated", "--frames", 2, "--seed", 5)
+    assert [frame["name"] for frame in result.frames] == ["000000", "000001"]
+    assert streets == [(5, 2)]
+    np.testing.assert_allclose(result.frames[0]["truth"]["boxes"], TRUTH, atol=2e-3)
+    result = view("simulated", "--frames", 8, "--split", "val")
+    assert [frame["name"] for frame in result.frames] == ["000003", "000007"]
+    assert "no images; leave out --image" in view("simulated", "--image").err
 
 
 def test_images_are_shown_with_boxes(view: Any, tmp_path: Path) -> None:
@@ -170,8 +180,8 @@ BAD = {
     "absent": ["{tmp}/absent.bin"],
     "no cloud": ["{tmp}/nothing"],
     "part of a data set": ["{tmp}/kitti/training"],
-    "unknown frame": ["{tmp}/kitti", "--frames", "17"],
-    "no frames": ["{tmp}/kitti", "--most", "0"],
+    "unknown frame": ["{tmp}/kitti", "--names", "17"],
+    "no frames": ["{tmp}/kitti", "--frames", "0"],
     "no page": ["{tmp}/kitti", "--out", "picture.png"],
     "page below a file": ["{tmp}/kitti", "--out", "{tmp}/kitti/training/calib/000000.txt/view.html"],
     "both": ["{tmp}/kitti", "--weights", "w.safetensors", "--results", "{tmp}/nothing"],

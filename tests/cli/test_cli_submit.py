@@ -2,6 +2,7 @@
 
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -44,6 +45,22 @@ def test_a_complete_folder_becomes_an_archive(complete: Path, tmp_path: Path) ->
     assert (tmp_path / "b.zip").read_bytes() == (tmp_path / "out" / "a.zip").read_bytes()
 
 
+def test_the_command_writes_the_archive_or_lists_the_problems(run: Any, complete: Path, tmp_path: Path) -> None:
+    result = run("submit", complete, tmp_path / "a.zip")
+    assert (result.code, result.out) == (0, f"Wrote {tmp_path / 'a.zip'} with 7518 files.\n")
+    (complete / "000007.txt").write_text("Car\n")
+    (complete / "000008.txt").unlink()
+    result = run("submit", complete, tmp_path / "b.zip")
+    for name in ("000007.txt", "000008.txt"):
+        (complete / name).write_text("")
+    assert result.code == 1
+    missing, bad, summary = result.out.splitlines()
+    assert missing.startswith(f"{complete}: 1 of 7518 files are missing (000008.txt); ")
+    assert bad.startswith(f"{complete / '000007.txt'}, line 1: 1 columns")
+    assert summary == f"2 problems; {tmp_path / 'b.zip'} was not written."
+    assert not (tmp_path / "b.zip").exists()
+
+
 def test_missing_and_foreign_files(results: Path, tmp_path: Path) -> None:
     (results / "007518.txt").write_text("")
     (results / "notes.txt").write_text("not a result")
@@ -66,12 +83,12 @@ def test_an_empty_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        (ROW.rsplit(" ", 1)[0], "a result has 16 columns, the score last; add it."),
+        (ROW.rsplit(" ", 1)[0], "a result has 16 columns, the score last; add the score."),
         (ROW + " 1", "17 columns; a label has 15 and a result 16, so write it again."),
-        (ROW.replace("0.9", "nan"), "a value is not finite; write a number there."),
+        (ROW.replace("0.9", "nan"), "the score is not finite; write a number there."),
         (ROW.replace("0.9", "high"), "could not convert string to float: 'high'; write a number there"),
-        (ROW.replace("100 150", "300 150"), "the image box is empty; write its edges in pixels"),
-        (ROW.replace("1.5 1.6 3.9", "-1 -1 -1"), "the height, width and length must be positive; mend or remove"),
+        (ROW.replace("100 150", "300 150"), "the image box is empty; give its edges in pixels"),
+        (ROW.replace("1.5 1.6 3.9", "-1 -1 -1"), "height, width and length must be positive; correct or remove"),
         (ROW, "the same row as in {path}, line 1; remove one of the two."),
     ],
 )
