@@ -13,6 +13,7 @@ from ciassd_jax.config import Config
 from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.data.folders import find_root, open_dataset
 from ciassd_jax.data.frames import Dataset
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.inference.weights import Weights, check_fits, find_weights, load_weights
 from ciassd_jax.simulation import open_synthetic, split_synthetic
 
@@ -44,7 +45,10 @@ def load_as(path: Path, preset: str | None) -> Weights:
     if preset is None:
         return weights
     config = PRESETS[preset]()
-    check_fits(weights, config, path)
+    try:
+        check_fits(weights, config, path)
+    except InputError as error:
+        raise UsageError(f"--preset {preset} cannot be used: {error}") from error
     return weights._replace(config=config)
 
 

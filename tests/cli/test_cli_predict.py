@@ -240,7 +240,7 @@ BAD: dict[str, tuple[Callable[[Path], dict[str, Any]], str]] = {
     "no torch file": (lambda t: {"weights": write(t / "x.pth", b"junk")}, r"x\.pth is damaged or .*PyTorch"),
     "another config": (
         lambda t: {"preset": "car"},
-        r"small\.safetensors .*another config: .* tensors .*; leave out --preset",
+        r"--preset car .*small\.safetensors .*another config: .* tensors ",
     ),
     "threshold": (lambda t: {"score-threshold": 1.5}, r"score_threshold: 1\.5 is outside \[0, 1\)"),
     "out is a file": (
