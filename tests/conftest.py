@@ -6,9 +6,10 @@ import shutil
 import tempfile
 from pathlib import Path
 
-os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+import jaxlib
+
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# A program that one test compiled serves the others, in the other workers and in processes that tests start.
+# A program compiled by one test serves the others, also in other workers and in processes that tests start.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="ciassd_jax_tests_")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"])
@@ -24,6 +25,21 @@ import pytest
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 SHARED = Path(__file__).parents[2] / "shared"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Set the compiler's flags; XLA reads them when the first program is compiled.
+
+    The quick suite spends its time in the compiler, so it skips the costly passes. Any other selection of tests
+    (`-m slow`, `-m reference`) runs the programs that users run.
+    """
+    flags = "--xla_force_host_platform_device_count=2"
+    if config.option.markexpr == "not slow":
+        flags += " --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+        # XLA aborts on a flag that it does not know.
+        if jaxlib.version.__version_info__ < (0, 12):
+            flags += " --xla_cpu_use_fusion_emitters=false"
+    os.environ.setdefault("XLA_FLAGS", flags)
 
 
 @pytest.fixture(scope="session")
