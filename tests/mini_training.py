@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from mini_folders import NAMES, write_kitti, write_split
-from small import compiling_quickly, random_variables, small_config
+from small import random_variables, small_config
 
 from ciassd_jax import Config, make_batches, open_dataset
 from ciassd_jax.config import DataConfig
@@ -54,25 +54,18 @@ def mini_fit(root: Path, workdir: Path, say: Callable[[str], object] = lambda te
     return fit(config, batches, workdir, **chosen)
 
 
-def compile_quickly(run: Any, batch: Any) -> Any:
-    """`fit` compiles with `QUICK` where this is in the place of its method."""
-    with compiling_quickly():
-        return _compile(run, batch)
-
-
-def share_training_programs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compile the step of a config once for all trainings of this process."""
+def share_training_programs(monkeypatch: pytest.MonkeyPatch, programs: dict[Any, Any] = _PROGRAMS) -> None:
+    """Compile the step of a config once for all trainings that share `programs`."""
 
     def compile_once(self: Any, batch: Any) -> Any:
         # The step does not read how the data is made.
         key = replace(self.config, data=DataConfig()), batch.frame.sharding, len(batch.frame)
-        if key not in _PROGRAMS:
-            _PROGRAMS[key] = compile_quickly(self, batch)
-        return _PROGRAMS[key]
+        if key not in programs:
+            programs[key] = _compile(self, batch)
+        return programs[key]
 
     monkeypatch.setattr(loop._Run, "_compile", compile_once)
 
 
 if __name__ == "__main__":
-    loop._Run._compile = compile_quickly  # type: ignore[method-assign]
     mini_fit(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,8 +1,6 @@
 """A detector that compiles in seconds, with a scene and a camera for it."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -15,8 +13,6 @@ from ciassd_jax import Config, Detector, init_variables, tiny
 from ciassd_jax.inference.detector import bucket_of
 from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
 
-# Tests that make few steps spend their time in the compiler, which takes a third of it without its costly passes.
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 _PROGRAMS: dict[tuple[Config, int], Any] = {}
 _compile = Detector.compile
 
@@ -68,23 +64,13 @@ Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
 IMAGE_SIZE = (640, 480)
 
 
-@contextmanager
-def compiling_quickly() -> Iterator[None]:
-    """What is lowered and compiled here is compiled with `QUICK`."""
-    compile_lowered = jax.stages.Lowered.compile
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax.stages.Lowered, "compile", lambda self: compile_lowered(self, QUICK))
-        yield
-
-
 def share_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compile each program once for all detectors of this process."""
 
     def compile_once(self: Detector, num_points: int) -> Any:
         key = self.config, bucket_of(num_points)
         if key not in _PROGRAMS:
-            with compiling_quickly():
-                _PROGRAMS[key] = _compile(self, num_points)
+            _PROGRAMS[key] = _compile(self, num_points)
         return _PROGRAMS[key]
 
     monkeypatch.setattr(Detector, "compile", compile_once)

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 from ciassd_jax import Detector
 from ciassd_jax.ops.footprints import points_in_boxes
@@ -18,6 +19,7 @@ def overlaps(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     return np.asarray(jax.jit(iou_3d)(*(Boxes.from_array(boxes.astype(np.float32)) for boxes in pair)))
 
 
+@pytest.mark.slow
 def test_they_find_the_cars_of_streets_that_nobody_trained_on() -> None:
     detector = Detector.from_pretrained("car_lite")
     dataset = open_synthetic(SEED, STREETS)

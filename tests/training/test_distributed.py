@@ -15,7 +15,7 @@ from mini_training import write_data
 from ciassd_jax.training import distributed
 from ciassd_jax.training.distributed import ParallelError, connect, data_mesh, describe
 
-PROGRAM = [sys.executable, str(Path(__file__).with_name("processes.py"))]
+PROGRAM = [sys.executable, str(Path(__file__).parents[1] / "processes.py")]
 
 
 def free_port() -> int:
@@ -38,6 +38,7 @@ def run_together(*commands: Sequence[object]) -> list[tuple[int, str, str]]:
     return [(process.returncode, *texts) for process, texts in zip(started, ended, strict=True)]
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_same_update(tmp_path: Path) -> None:
     """Gradients to 1e-6 relative and parameters to 1e-5, in float64."""
     address = f"localhost:{free_port()}"
@@ -54,6 +55,7 @@ def test_two_processes_make_the_same_update(tmp_path: Path) -> None:
         assert difference <= limit, name
 
 
+@pytest.mark.slow
 def test_two_processes_stop_together_and_one_goes_on(tmp_path: Path) -> None:
     data, workdir = write_data(tmp_path / "data"), tmp_path / "run"
     options = ("--preset", "tiny", "--data", data, "--workdir", workdir, "--batch-size", 2, "--steps", 6)

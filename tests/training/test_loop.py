@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from mini_training import (
     STEPS,
-    compile_quickly,
     mini_batches,
     mini_config,
     mini_fit,
@@ -37,9 +36,11 @@ from ciassd_jax.training.signals import signals_noted
 from ciassd_jax.types import TrainState
 
 
-@pytest.fixture(autouse=True)
-def _compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    share_training_programs(monkeypatch)
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        share_training_programs(patch, {})
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -60,10 +61,7 @@ def whole(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Fitted,
     """A run that nothing cut off, its folder and what it said."""
     workdir, said = tmp_path_factory.mktemp("whole") / "new", []
     validation = open_dataset(root, "val")
-    with pytest.MonkeyPatch.context() as patch:
-        # The program of the other runs, but compiled here, so that this is said.
-        patch.setattr(loop._Run, "_compile", compile_quickly)
-        return mini_fit(root, workdir, said.append, validation=validation), workdir, said
+    return mini_fit(root, workdir, said.append, validation=validation), workdir, said
 
 
 def assert_same_bits(some: TrainState, others: TrainState) -> None:
@@ -149,10 +147,11 @@ def test_a_stopped_run_goes_on_with_the_same_bits(
     assert_same_bits(mini_fit(root, tmp_path).state, whole[0].state)
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_with_the_same_bits(
     whole: tuple[Fitted, Path, list[str]], root: Path, tmp_path: Path
 ) -> None:
-    program = Path(__file__).with_name("mini_training.py")
+    program = Path(__file__).parents[1] / "mini_training.py"
     process = subprocess.Popen([sys.executable, str(program), str(root), str(tmp_path)], stderr=subprocess.PIPE)
     checkpoints, deadline = tmp_path / "checkpoints", time.monotonic() + 300
     # The next checkpoint may be half-written when the first is complete.
@@ -208,7 +207,7 @@ def test_a_dead_worker_loses_no_step(
 
 
 def test_losses_that_stay_not_finite_end_it(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "_HOPELESS", 4)
+    monkeypatch.setattr(loop, "_HOPELESS", 4)
     broken = jax.tree.map(lambda leaf: leaf * np.float32(np.nan), random_variables(mini_config()))
     with pytest.raises(TrainingError, match="last 4 updates were not finite"):
         mini_fit(root, tmp_path, variables=broken, intervals=Intervals(log=4))

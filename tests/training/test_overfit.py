@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+import pytest
 from small import random_scene, random_variables, small_config
 
 from ciassd_jax import Config, create_train_state, predict, train_step
@@ -27,6 +28,7 @@ def seen_scene(config: Config, seed: int) -> Scene:
     return scene._replace(cloud=scene.cloud._replace(points=points, count=np.int32(count)))
 
 
+@pytest.mark.slow
 def test_every_car_of_two_scenes_is_found_after_training() -> None:
     config = small_config()
     schedule = replace(config.schedule, total_steps=STEPS, learning_rate=1e-2)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small import QUICK, random_scene, random_variables, small_cloud, small_config
+from small import random_scene, random_variables, small_cloud, small_config
 
 from ciassd_jax import Config, car, create_train_state, make_batches, train_step
 from ciassd_jax.config import ScheduleConfig
@@ -26,11 +26,13 @@ from ciassd_jax.model.network import variables_of
 from ciassd_jax.training.optimizer import learning_rate, make_optimizer, momentum
 from ciassd_jax.types import Boxes, Scene
 
-step = jax.jit(train_step, static_argnames=("config", "axis_name"), compiler_options=QUICK)
+step = jax.jit(train_step, static_argnames=("config", "axis_name"))
 
 
-def short(config: Config, **changes: Any) -> Config:
-    return replace(config, schedule=replace(config.schedule, total_steps=20, **changes))
+def short(**schedule: Any) -> Config:
+    """A training of twenty steps; most tests share the program of its defaults."""
+    config = small_config()
+    return replace(config, schedule=replace(config.schedule, **{"total_steps": 20, "ema_decay": 0.5} | schedule))
 
 
 @cache
@@ -96,7 +98,7 @@ def test_optimizer_is_clipped_adam_with_decay_first(scale):
 
 
 def test_twenty_steps_learn_and_repeat_bit_for_bit():
-    config = short(small_config())
+    config = short()
 
     def run() -> tuple[Any, list[float]]:
         state, losses = fresh(config), []
@@ -114,7 +116,7 @@ def test_twenty_steps_learn_and_repeat_bit_for_bit():
 
 
 def test_metrics_are_scalars_that_count_what_was_lost():
-    config = short(small_config())
+    config = short()
     crowded = batch()._replace(points_cut=np.array([3, 4], np.int32), boxes_cut=np.array([1, 0], np.int32))
     _, metrics = step(fresh(config), crowded, config)
     assert {name: value.shape for name, value in metrics.items()} == dict.fromkeys(metrics, ())
@@ -127,7 +129,7 @@ def test_metrics_are_scalars_that_count_what_was_lost():
 
 @pytest.mark.filterwarnings("ignore:overflow encountered")
 def test_an_update_that_is_not_finite_is_left_out_and_counted():
-    config = short(small_config(), ema_decay=0.9)
+    config = short()
     state, _ = step(fresh(config), batch(), config)
     params = jax.tree.map(jnp.asarray, state.params)
     params["head"]["box"]["kernel"] = params["head"]["box"]["kernel"].at[0, 0, 0, 0].set(jnp.nan)
@@ -143,7 +145,7 @@ def test_an_update_that_is_not_finite_is_left_out_and_counted():
 
 @pytest.mark.parametrize("empty", ["no boxes", "no points", "nothing"])
 def test_empty_scenes_stay_finite(empty):
-    config = short(small_config())
+    config = short()
     scenes = batch()
     if empty != "no points":
         truth = scenes.truth._replace(count=np.zeros(2, np.int32), label=np.full_like(scenes.truth.label, -1))
@@ -158,7 +160,7 @@ def test_empty_scenes_stay_finite(empty):
 
 def test_an_epoch_of_all_sizes_is_traced_once():
     """Frames without points, without boxes, and with more points than fit, in one program of each part."""
-    config, clouds = short(small_config()), {"many": 5000, "none": 0, "one": 1, "some": 300, "few": 40, "usual": 600}
+    config, clouds = short(), {"many": 5000, "none": 0, "one": 1, "some": 300, "few": 40, "usual": 600}
 
     def read(name: str) -> Frame:
         objects = 0 if name in ("none", "few") else 2
@@ -177,53 +179,71 @@ def test_an_epoch_of_all_sizes_is_traced_once():
 
 
 def test_running_mean_of_the_parameters_serves_prediction():
-    config = short(small_config(), ema_decay=0.5)
+    config = short()
     start = fresh(config)
     state, _ = step(start, batch(), config)
     expected = jax.tree.map(lambda old, new: (old + new) / 2, start.params, state.params)
     chex.assert_trees_all_close(state.ema, expected, rtol=1e-6)
     chex.assert_trees_all_equal(variables_of(state)["params"], state.ema)
-    plain = fresh(short(small_config()))
+    plain = fresh(short(ema_decay=0.0))
     assert plain.ema is None
     chex.assert_trees_all_equal(variables_of(plain)["params"], plain.params)
 
 
+def test_accumulated_gradients_make_one_update():
+    """That of their mean."""
+    rng = np.random.default_rng(0)
+    params, *gradients = ({"kernel": rng.normal(size=(3, 4)).astype(np.float32)} for _ in range(3))
+    twice, once = (make_optimizer(ScheduleConfig(total_steps=10, gradient_accumulation_steps=n)) for n in (2, 1))
+    state = twice.init(params)
+    first, state = jax.jit(twice.update)(gradients[0], state, params)
+    assert not first["kernel"].any()
+    second, _ = jax.jit(twice.update)(gradients[1], state, params)
+    mean = jax.tree.map(lambda a, b: (a + b) / 2, *gradients)
+    expected, _ = jax.jit(once.update)(mean, once.init(params), params)
+    chex.assert_trees_all_close(second, expected, rtol=1e-5)
+
+
+@pytest.mark.slow
 def test_accumulated_steps_make_one_update():
-    config = short(small_config(), gradient_accumulation_steps=2)
+    config = short(gradient_accumulation_steps=2)
     start = fresh(config)
     once, _ = step(start, batch(), config)
     chex.assert_trees_all_equal(once.params, start.params)
     twice, metrics = step(once, batch(), config)
     assert float(metrics["learning_rate"]) == pytest.approx(3e-4)
-    whole, _ = step(fresh(short(small_config())), batch(), short(small_config(), gradient_accumulation_steps=1))
+    whole, _ = step(fresh(short()), batch(), short())
     # Batch statistics differ between the two steps, the parameters and so the gradients of training mode do not.
     chex.assert_trees_all_close(twice.params, whole.params, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_rematerialised_gradients_are_the_same():
-    config = short(small_config())
+    config = short()
     plain, _ = step(fresh(config), batch(), config)
-    again = short(small_config(), remat=True)
+    again = short(remat=True)
     other, _ = step(fresh(again), batch(), again)
     chex.assert_trees_all_close(plain.params, other.params, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_bfloat16_keeps_parameters_and_statistics_in_float32():
-    config = replace(short(small_config()), dtype="bfloat16")
+    config = replace(short(), dtype="bfloat16")
     state, metrics = step(fresh(config), batch(), config)
-    exact, expected = step(fresh(short(small_config())), batch(), short(small_config()))
+    exact, expected = step(fresh(short()), batch(), short())
     assert {leaf.dtype for leaf in jax.tree.leaves((state.params, state.batch_stats))} == {jnp.dtype("float32")}
     assert all(value.dtype in (jnp.float32, jnp.int32) for value in metrics.values())
     assert float(metrics["loss"]) == pytest.approx(float(expected["loss"]), rel=0.05)
     assert jax.tree.structure(state) == jax.tree.structure(exact)
 
 
+@pytest.mark.slow
 def test_several_devices_make_the_same_update():
     """Gradients to 1e-6 relative and parameters to 1e-5, in float64; pooled statistics and metrics too.
 
     Measured in a process with eight devices; one test, so that it is started once.
     """
-    command = [sys.executable, str(Path(__file__).parent / "devices.py")]
+    command = [sys.executable, str(Path(__file__).parents[1] / "devices.py")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
