@@ -14,7 +14,7 @@ import safetensors.numpy
 from released import LAYOUTS, State, released_state, write_pth
 from small import random_variables, small_config
 
-from ciassd_jax import car_released
+from ciassd_jax import car_lite, car_released
 from ciassd_jax.formats.errors import InputError
 from ciassd_jax.inference.weights import check_fits, load_released_weights, load_weights, save_weights
 
@@ -102,10 +102,50 @@ def test_our_file_must_fit_exactly(ours: Path, change: Any, message: str) -> Non
         load_weights(edit(ours, change))
 
 
-def test_a_config_of_another_version_is_named(ours: Path) -> None:
-    config = json.loads(small_config().to_json()) | {"novelty": 1}
-    with pytest.raises(InputError, match=r"another version of the package: .*unknown \['novelty'\]"):
+@pytest.mark.parametrize(("name", "words"), [("novelty", "known are backbone"), ("scedule", "did you mean 'schedule'")])
+def test_a_config_of_another_version_is_named(ours: Path, name: str, words: str) -> None:
+    config = json.loads(small_config().to_json()) | {name: 1}
+    with pytest.raises(InputError, match=rf"ours\.safetensors .*another version of the package: .*'{name}'.*{words}"):
         load_weights(edit(ours, lambda tensors: None, config=json.dumps(config)))
+
+
+# What the fields were called before, besides a copy of `grid.max_voxels` as the first stage's capacity.
+OLD_NAMES = {
+    "gt_sampling": "paste",
+    "max_gt_sampling_points": "max_paste_points",
+    "gt_sampling_up_to": "paste_up_to",
+    "gt_sampling_min_points": "paste_min_points",
+    "nms_iou_threshold": "nms_overlap",
+    "gradient_accumulation_steps": "accumulate",
+    "remat": "rematerialize",
+    "b1_range": "momentum",
+    "b2": "second_moment",
+    "div_factor": "start_divisor",
+    "final_div_factor": "end_divisor",
+}
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_file_with_the_old_names_loads_as_before(ours: Path) -> None:
+    text = small_config().to_json().replace('"capacity": null', f'"capacity": {small_config().grid.max_voxels}')
+    for new, old in OLD_NAMES.items():
+        assert f'"{new}":' in text
+        text = text.replace(f'"{new}":', f'"{old}":')
+    loaded = load_weights(edit(ours, lambda tensors: None, config=text))
+    assert loaded.config == small_config()
+    assert_same(loaded.variables, random_variables(small_config()))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "path", ["ciassd_jax/bundled/car_lite.safetensors", "experiments/checkpoints/car_lite_kitti110.safetensors"]
+)
+def test_files_of_the_repository_load(path: str) -> None:
+    loaded = load_weights(Path(__file__).parents[2] / path)
+    expected = car_lite()
+    training = {"data": expected.data, "schedule": expected.schedule}
+    assert replace(loaded.config, **training) == expected
+    assert {row.status for row in loaded.report} == {"mapped"}
 
 
 @pytest.mark.parametrize("keep", [0, 7, 500, -1])
