@@ -23,7 +23,7 @@ class VoxelsByLoop(NamedTuple):
 def voxelize_loop(
     points: np.ndarray, *, minimum, voxel_size, cells, max_points: int, max_voxels: int, overflow: str
 ) -> VoxelsByLoop:
-    """SPEC section 3, point after point; points that are not finite are dropped and counted."""
+    """Voxelise point after point (paper section 4.1); points that are not finite are dropped and counted."""
     minimum, voxel_size = np.array(minimum, np.float32), np.array(voxel_size, np.float32)
     members: dict[tuple, list[int]] = {}
     lost, in_range, points_dropped, stopped = set(), 0, 0, False
@@ -59,7 +59,7 @@ def voxelize_loop(
 def sparse_convolution_loop(
     coords: np.ndarray, features: np.ndarray, weight: np.ndarray, stride, padding, shape, submanifold: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """SPEC section 4 for one scene, in float64: every input adds to the outputs whose windows hold it.
+    """Sparse convolution of one scene in float64 (paper section 3.1): every input adds to the outputs whose windows hold it.
 
     `coords` (N, 3) are (z, y, x) in any order, `weight` is (kD, kH, kW, Cin, Cout), `shape` the grid of the
     input. Returns the active outputs, sorted lexicographically, and their features.
@@ -159,7 +159,7 @@ def released_di_nms_loop(
     sigma_squared: tuple[float, ...],
     distances: tuple[float, ...],
 ) -> list[Cluster]:
-    """SPEC 10.2 as written, one candidate after the other; the box is NaN beyond the last distance.
+    """DI-NMS of the released code, one candidate after the other; the box is NaN beyond the last distance.
 
     `boxes` (K, 7) are x, y, z, length, width, height, yaw, `iou` (K, K) their overlaps. Where there are several
     classes, `iou` is zero between them: NMS per class, the one departure from the text.
@@ -200,7 +200,7 @@ def paper_di_nms_loop(
     sigma_squared: tuple[float, ...],
     distances: tuple[float, ...],
 ) -> list[Cluster]:
-    """Algorithm 1 with the decisions of SPEC's top table; arguments as of `released_di_nms_loop`."""
+    """Algorithm 1 of the paper; arguments as of `released_di_nms_loop`."""
     refined = refined_score(score, anchor_distance)
     remaining = list(range(len(boxes)))
     clusters = []
@@ -225,7 +225,7 @@ def paper_di_nms_loop(
 
 
 def upsample_loop(x: np.ndarray, kernel: np.ndarray) -> np.ndarray:
-    """SPEC section 5: out[2i - 1 + k] += in[i] * kernel[k] along each axis."""
+    """Transposed convolution: out[2i - 1 + k] += in[i] * kernel[k] along each axis."""
     batch, height, width, _ = x.shape
     out = np.zeros((batch, 2 * height, 2 * width, kernel.shape[-1]))
     for i, j, k, m in np.ndindex(height, width, 3, 3):

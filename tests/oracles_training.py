@@ -1,4 +1,4 @@
-"""Slow references of targets and losses: SPEC 7 and 8 as they stand, anchor after anchor, in the paper's r."""
+"""Slow references of targets and losses: one anchor after the other, in the paper's r."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def assign_by_loop(iou: np.ndarray, matched: float, unmatched: float) -> tuple[n
 
 
 def encode_by_hand(box: np.ndarray, anchor: np.ndarray) -> np.ndarray:
-    """SPEC 6.3 with r wrapped to [-pi, pi)."""
+    """Residuals of a box on an anchor, with r wrapped to [-pi, pi)."""
     x, y, z, width, length, height, r = (float(value) for value in box)
     xa, ya, za, wa, la, ha, ra = (float(value) for value in anchor)
     diagonal = math.hypot(la, wa)
@@ -58,7 +58,7 @@ def encode_by_hand(box: np.ndarray, anchor: np.ndarray) -> np.ndarray:
 
 
 def focal_by_hand(logit: float, label: int, alpha: float, gamma: float) -> float:
-    """SPEC 8, the class term of one anchor."""
+    """Focal loss of one anchor (paper section 3.3)."""
     if label < 0:
         return 0.0
     cross_entropy = max(logit, 0) - logit * label + math.log1p(math.exp(-abs(logit)))
@@ -67,6 +67,6 @@ def focal_by_hand(logit: float, label: int, alpha: float, gamma: float) -> float
 
 
 def smooth_l1_by_hand(error: float, sigma: float) -> float:
-    """SPEC 8, the smooth-L1 of one error."""
+    """Smooth-L1 loss of one error."""
     beta = 1 / sigma**2
     return error**2 / (2 * beta) if abs(error) <= beta else abs(error) - beta / 2

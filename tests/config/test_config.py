@@ -69,7 +69,7 @@ def test_presets_are_frozen_values(make):
 
 
 def test_the_paper_preset():
-    """SPEC section 0 and the table on top."""
+    """The values of the paper (sections 3 and 4)."""
     config = car()
     assert config.grid.cells == (1408, 1600, 40)
     assert config.grid.shape == (41, 1600, 1408)

@@ -18,8 +18,6 @@ from ciassd_jax.ops.boxes import encode, from_paper, to_paper
 from ciassd_jax.ops.nms import Clusters, rotated_nms
 from ciassd_jax.types import Boxes, Candidates, Predictions
 
-# One worker, so that nothing is compiled twice.
-
 # The golden README's tolerances.
 BOXES, SCORES = 1e-3, 1e-5
 CASES = range(13)

@@ -28,7 +28,7 @@ def test_golden_anchors(shared):
 
 
 def test_the_number_of_an_anchor():
-    """SPEC 6.1: ((row * 176) + column) * 2 + angle; rows run along y from -40, columns along x from 0."""
+    """((row * 176) + column) * 2 + angle; rows run along y from -40, columns along x from 0."""
     boxes, _ = make_anchors(car())
     for row, column, angle in [(0, 0, 0), (0, 0, 1), (0, 175, 0), (199, 0, 1), (123, 45, 1)]:
         number = (row * 176 + column) * 2 + angle

@@ -30,7 +30,7 @@ def shapes_of(config: Config) -> dict:
     ],
 )
 def test_a_neck_is_its_layers_and_nothing_else_changes(kind: str, kernels: list[tuple[int, ...]]) -> None:
-    """SPEC, below its table of presets."""
+    """Kernels of the necks that Table 4 compares with."""
     before, after = car(), with_neck(car(), kind)
     shapes, whole = shapes_of(after), shapes_of(before)
     assert shapes["backbone"] == whole["backbone"]

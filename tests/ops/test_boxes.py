@@ -52,8 +52,7 @@ def test_a_box_on_itself_has_zero_residuals():
     np.testing.assert_allclose(decode(jnp.zeros((50, 7)), boxes).to_array(), boxes.to_array(), rtol=0, atol=2e-6)
 
 
-def test_numbers_of_the_specification():
-    """SPEC A.2."""
+def test_numbers_of_the_released_code():
     box = from_paper(jnp.array([10.5, 1.9, -0.8, 1.7, 4.2, 1.5, -1.4]))
     anchor = from_paper(jnp.array([10.2, 2.2, -1, 1.6, 3.9, 1.56, 1.57]))
     expected = [0.0711668, -0.0711668, 0.1282051, 0.0606246, 0.0741080, -0.0392207, -2.97]
@@ -75,7 +74,7 @@ def test_golden_codes(shared):
 
 
 def test_paper_order_and_angle():
-    """SPEC 1.2: heading (-sin r, -cos r); width before length; r = -pi / 2 looks along +x."""
+    """Heading (-sin r, -cos r); width before length; r = -pi / 2 looks along +x."""
     array = jnp.array([[1, 2, 3, 1.6, 3.9, 1.5, -np.pi / 2], [1, 2, 3, 1.6, 3.9, 1.5, 0.3]], jnp.float32)
     boxes = from_paper(array)
     np.testing.assert_array_equal(boxes.center, array[:, :3])
@@ -126,7 +125,7 @@ def test_half_a_turn_wraps_to_its_lower_end():
 
 
 def test_direction_turns_a_box_when_its_sign_disagrees():
-    """SPEC 10.4: (r > 0) xor (class 1); the comparison is strict, so r = 0 counts as class 0."""
+    """(r > 0) xor (class 1); the comparison is strict, so r = 0 counts as class 0."""
     r = jnp.array([0.4, 0.4, -0.4, -0.4, 0.0, 0.0, 3.5, -3.5])
     direction = jnp.array([1, 0, 1, 0, 1, 0, 0, 1])
     expected = jnp.array([0.4, 0.4 + np.pi, -0.4 + np.pi, -0.4, np.pi, 0.0, 3.5 + np.pi, -3.5 + np.pi])

@@ -20,7 +20,7 @@ def random_points(number: int) -> np.ndarray:
 
 
 def inside_by_projection(points: np.ndarray, projection: np.ndarray, width: int, height: int) -> np.ndarray:
-    """SPEC 1.3 as it stands."""
+    """Projection with KITTI's matrices, then the image's bounds."""
     a, b, d = projection @ np.vstack([points.T, np.ones(len(points))])
     return (d > 0.001) & (d < 100) & (a / d > 0) & (a / d < width) & (b / d > 0) & (b / d < height)
 

@@ -234,8 +234,8 @@ def test_volume_overlap_above_one_another(lift, expected):
     np.testing.assert_allclose(in_float32(a, b, "3d"), expected, rtol=0, atol=1e-6)
 
 
-def test_numbers_of_the_specification():
-    """SPEC A.2, in the paper's angle: yaw = -r - pi / 2."""
+def test_numbers_of_the_released_code():
+    """In the paper's angle: yaw = -r - pi / 2."""
     a = np.array([[0, 0, -1.0, 3.9, 1.6, 1.5, -np.pi / 2]])
     b = np.array([[0.3, 0.5, -0.9, 4.1, 1.7, 1.6, -0.25 - np.pi / 2]])
     np.testing.assert_allclose(in_float64(a, b, intersection_bev), 4.8238386, rtol=0, atol=1e-7)

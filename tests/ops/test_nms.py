@@ -21,8 +21,6 @@ from ciassd_jax.ops.nms import (
 )
 from ciassd_jax.types import Boxes, Candidates
 
-# One worker, so that nothing is compiled twice.
-
 SETTINGS = {"overlap": 0.3, "sigma_squared": (0.0009, 0.009, 0.1, 1.0), "distances": (20.0, 40.0, 60.0)}
 SLOTS = 64
 
@@ -490,7 +488,7 @@ def test_a_candidate_that_overflowed_spoils_no_other(run):
         np.testing.assert_array_equal(clusters.boxes.to_array()[np.array(rows)], sane.boxes.to_array()[np.array(rows)])
 
 
-# SPEC A.1: x y z w l h r, f, q, xa ya, direction
+# Numbers of the released code. Columns: x y z w l h r, score f, quality q, anchor x y, direction
 
 
 A1 = np.array(
@@ -535,7 +533,7 @@ def a1() -> Scene:
     return make_scene(boxes, A1[:, 7], A1[:, 8], distance, np.zeros(15, int), [2.6])
 
 
-def test_numbers_of_the_specification_released(a1):
+def test_numbers_of_the_released_code(a1):
     numbers, boxes, scores = selection(*run_released(*to_candidates(a1)))
     assert numbers.tolist() == [0, 2]
     assert A1[numbers, 11].tolist() == [1, 0]
@@ -543,14 +541,14 @@ def test_numbers_of_the_specification_released(a1):
     np.testing.assert_allclose(scores, A1_SCORES[:2], rtol=0, atol=1e-5)
 
 
-def test_support_numbers_of_the_specification(a1):
+def test_support_numbers_of_the_released_code(a1):
     assert_supports(a1, A1_SUPPORT)
     iou = pairwise_iou(to_candidates(a1)[0].boxes, jnp.int32(15))
     expected = [0.7296414, 0.6794287, 0.8667628, 0.5105073]
     np.testing.assert_allclose(iou[2, jnp.array([3, 7, 8, 14])], expected, rtol=0, atol=1e-5)
 
 
-def test_the_loop_gives_the_numbers_of_the_specification(a1):
+def test_the_loop_gives_the_numbers_of_the_released_code(a1):
     """The oracle itself: the numbers come from the authors' code, not from this project."""
     clusters = a1.by_loop(released_di_nms_loop)
     found = [c for c in clusters if c.supported]

@@ -30,8 +30,6 @@ from ciassd_jax.training.losses import (
 from ciassd_jax.training.targets import assign_targets
 from ciassd_jax.types import Boxes, GroundTruth, LossTerms, Predictions, Targets
 
-# One worker, so that nothing is compiled twice.
-
 # Eagerly the overlap alone would compile a hundred programs.
 total_loss = jax.jit(detection_loss, static_argnames="config")
 batch_losses = jax.jit(scene_losses, static_argnames="config")
@@ -156,8 +154,8 @@ def test_golden_gradients(shared):
 # By hand
 
 
-def test_focal_loss_of_the_specification():
-    """SPEC A.4: alpha weighs the positives; an ignored anchor costs nothing."""
+def test_focal_loss_of_the_released_code():
+    """Alpha weighs the positives; an ignored anchor costs nothing."""
     loss = classification_loss(jnp.full(3, 0.5), jnp.array([1, 0, -1]), **FOCAL)
     np.testing.assert_allclose(loss, [0.01689337, 0.28305870, 0], rtol=1e-6)
 
@@ -183,7 +181,7 @@ def test_focal_gradient_by_hand():
 
 
 def test_smooth_l1_by_hand():
-    """SPEC A.4, both sides of the joint, other sigmas, and slopes: sigma**2 * error, then the sign."""
+    """Both sides of the joint, other sigmas, and slopes: sigma**2 * error, then the sign."""
     errors = jnp.array([0.05, 1 / 9, 0.5, -0.05, -0.5, 0.0])
     half = [0.01125, 0.0555556, 0.4444444]
     np.testing.assert_allclose(smooth_l1(errors, sigma=3.0), [*half, half[0], half[2], 0], rtol=1e-6)

@@ -45,7 +45,7 @@ def fresh(config: Config) -> Any:
 
 
 def test_one_cycle_as_released():
-    """SPEC A.4."""
+    """Numbers of the released schedule."""
     schedule = car().schedule
     for at, rate, decay in (
         (0, 3e-4, 0.95),

@@ -18,8 +18,6 @@ from ciassd_jax.ops.boxes import direction_target, from_paper, nearest_aligned, 
 from ciassd_jax.training.targets import assign_targets, nearest_iou
 from ciassd_jax.types import Boxes, GroundTruth, Targets
 
-# One worker, so that nothing is compiled twice.
-
 # Two classes on a grid of numbers that float32 holds exactly, so that ties are ties in any arithmetic.
 SMALL = replace(
     tiny(),
@@ -89,8 +87,7 @@ def test_golden_targets(shared, name):
     assert not np.asarray(targets.box)[np.asarray(targets.label) != 1].any()
 
 
-def test_numbers_of_the_specification():
-    """SPEC A.3."""
+def test_numbers_of_the_released_code():
     boxes = [
         (20.3, 3.1, -0.8, 1.65, 4.1, 1.5, 0.3),
         (41.0, -12.25, -1.1, 1.8, 4.6, 1.7, -1.45),
