@@ -59,7 +59,7 @@ def voxelize_loop(
 def sparse_convolution_loop(
     coords: np.ndarray, features: np.ndarray, weight: np.ndarray, stride, padding, shape, submanifold: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sparse convolution of one scene in float64 (paper section 3.1): every input adds to the outputs whose windows hold it.
+    """Convolve the sites of one scene in float64: every input adds to the outputs whose windows hold it.
 
     `coords` (N, 3) are (z, y, x) in any order, `weight` is (kD, kH, kW, Cin, Cout), `shape` the grid of the
     input. Returns the active outputs, sorted lexicographically, and their features.

@@ -200,6 +200,7 @@ def test_final_boxes(shared: Path, golden: dict, frame: str) -> None:
     np.testing.assert_allclose(detections.score[0, :count], golden[f"{frame}_final_scores"], rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_batch_of_four_is_four_singles(shared: Path) -> None:
     """At the real size, voxels on the borders of cells included: one frame three times would not show those."""
     weights, _ = network(shared)

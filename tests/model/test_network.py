@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from oracles_network import postprocess_by_loop, predict_by_loop
 
 from ciassd_jax.config import Config, presets
 from ciassd_jax.inference.postprocess import postprocess
@@ -21,6 +22,7 @@ TINY = presets.tiny()
 # A quarter of its area, for training by the dense definition.
 SMALL = replace(TINY, grid=replace(TINY.grid, minimum=(0.0, -3.2, -3.0), maximum=(6.4, 3.2, 1.0)))
 run = jax.jit(predict_raw, static_argnames="config")
+finish = jax.jit(postprocess, static_argnames="config")
 
 
 @jax.jit
@@ -94,6 +96,38 @@ def test_parameter_shapes_of_the_car():
     released = shapes_of(presets.car_released())["params"]
     assert released["neck"]["spatial_attention"]["kernel"].shape == (1, 1, 128, 1)
     assert jax.tree.map(jnp.shape, released["head"]["iou"]) == {"kernel": (3, 3, 128, 2)}
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_predictions_are_those_of_the_definition(variables, seed):
+    """Voxels, sparse convolutions, neck and head of made-up points, computed by loops in float64."""
+    points = random_points(seed, 300)
+    raw, _ = run_one(variables, batch_of(points))
+    assert not raw.sites_dropped.any()
+    assert_close(jax.tree.map(lambda leaf: leaf[0], raw.predictions), predict_by_loop(variables, points, TINY))
+
+
+@pytest.mark.parametrize("nms", ["paper", "released"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_detections_are_those_of_the_definition(variables, seed, nms):
+    """From the network's predictions on: rectification, DI-NMS, direction and range by loops in float64."""
+    config = replace(
+        TINY,
+        classes=(replace(TINY.classes[0], support_threshold=1.0),),
+        detection=replace(TINY.detection, nms=nms, clamp_iou=nms == "paper"),
+    )
+    cloud = batch_of(random_points(seed, 300))
+    raw, _ = run_one(variables, cloud)
+    found = finish(raw, cloud, config)
+    expected = postprocess_by_loop(jax.tree.map(lambda leaf: leaf[0], raw.predictions), config)
+    assert expected.margin > 1e-5
+    count = int(found.count[0])
+    assert count == len(expected.boxes) > 5
+    difference = np.asarray(found.boxes.to_array())[0, :count] - expected.boxes
+    difference[:, 6] = (difference[:, 6] + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(difference, 0, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found.score[0, :count], expected.score, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(found.label[0, :count], expected.label)
 
 
 def test_one_compile_serves_0_1_and_all_points(variables):
