@@ -128,11 +128,14 @@ class NeighbourTable(NamedTuple):
     """Which input site each kernel offset reads, and its transpose for the backward pass.
 
     `inputs[o, k]` is the input site under offset k of output site o, `outputs[i, k]` the output site that
-    reads input site i through offset k. Where there is none, the number of input (output) slots stands.
+    reads input site i through offset k. Where there is none, the number of input (output) slots stands. The first
+    `num_outputs` and `num_inputs` rows of a scene are real.
     """
 
     inputs: Int[Array, "*b V K"]
     outputs: Int[Array, "*b U K"]
+    num_outputs: Int[Array, "*b"]
+    num_inputs: Int[Array, "*b"]
 
 
 class Predictions(NamedTuple):

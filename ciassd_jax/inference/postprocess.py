@@ -5,13 +5,14 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ciassd_jax.config import ClassConfig, Config, DetectionConfig
 from ciassd_jax.model.anchors import make_anchors
 from ciassd_jax.model.network import RawPredictions
 from ciassd_jax.ops import boxes as box_ops
 from ciassd_jax.ops import camera, nms
+from ciassd_jax.ops.rows import take_rows
 from ciassd_jax.types import Array, Boxes, Candidates, Counts, Detections, PointCloud, Predictions
 
 RANGE_AXES = tuple[float, float]
@@ -45,16 +46,17 @@ def select_candidates(
     usable = passes & jnp.isfinite(score) & jnp.isfinite(predictions.box).all(-1)
     best, index = lax.top_k(jnp.where(usable, score, -jnp.inf), capacity)
     valid = jnp.isfinite(best)
-    chosen = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], anchors)
-    boxes = box_ops.decode(predictions.box[index], chosen)
+    said = (predictions.box, predictions.direction, quality, anchors, labels)
+    residuals, direction, quality, chosen, label = take_rows(said, index)
+    boxes = box_ops.decode(residuals, chosen)
     offset = boxes.center[:, :2] - chosen.center[:, :2]
     candidates = Candidates(
         boxes=boxes,
         score=jnp.where(valid, best, 0),
-        iou=quality[index],
+        iou=quality,
         anchor_distance=jnp.sqrt((offset**2).sum(-1)),
-        direction=jnp.argmax(predictions.direction[index], -1).astype(jnp.int32),
-        label=jnp.asarray(labels)[index],
+        direction=jnp.argmax(direction, -1).astype(jnp.int32),
+        label=label,
         valid=valid,
     )
     return candidates, passes.sum(dtype=jnp.int32) - valid.sum(dtype=jnp.int32)
@@ -99,12 +101,10 @@ def finish(
     minimum, maximum = zip(x_limits, y_limits, z_limits, strict=True)
     keep &= box_ops.inside_range(boxes, minimum, maximum)
     order = jnp.argsort(~keep, stable=True)
-
-    def compact(leaf: Array) -> Array:
-        chosen: Bool[Array, " K"] = keep[order]
-        return jnp.where(chosen.reshape((-1,) + (1,) * (leaf.ndim - 1)), leaf[order], 0)
-
-    boxes, score, label = jax.tree.map(compact, (boxes, clusters.score, candidates.label))
+    keep, *selected = take_rows((keep, boxes, clusters.score, candidates.label), order)
+    boxes, score, label = jax.tree.map(
+        lambda leaf: jnp.where(keep.reshape((-1,) + (1,) * (leaf.ndim - 1)), leaf, 0), tuple(selected)
+    )
     return boxes, score, label, keep.sum(dtype=jnp.int32)
 
 

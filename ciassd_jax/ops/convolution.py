@@ -13,6 +13,8 @@ Padding = tuple[tuple[int, int], tuple[int, int]]
 
 # Cells that a CPU multiplies at once for the gradient of a kernel, so that they stay in cache.
 _BLOCK_CELLS = 900
+# A map of no more cells is not worth the blocks, which take longer to compile.
+_FEW_CELLS = 4096
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
@@ -43,23 +45,34 @@ def _forward(x: Array, kernel: Array, padding: Padding, stride: int) -> tuple[Ar
 
 def _backward(padding: Padding, stride: int, saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
     x, kernel = saved
-    convolve = partial(convolve_2d.fun, padding=padding, stride=stride)
-    (to_x,) = jax.linear_transpose(lambda x: convolve(x, kernel), x)(gradient)
-
-    def whole(x: Array, gradient: Array) -> Array:
-        (to_kernel,) = jax.linear_transpose(lambda kernel: convolve(x, kernel), kernel)(gradient)
-        return to_kernel
-
-    blocked = partial(_kernel_gradient, size=(kernel.shape[0], kernel.shape[1]), padding=padding, stride=stride)
-    return to_x, lax.platform_dependent(x, gradient, cpu=blocked, default=whole)
+    (to_x,) = jax.linear_transpose(lambda x: convolve_2d.fun(x, kernel, padding, stride), x)(gradient)
+    return to_x, _kernel_gradients(x, gradient, kernel, padding, stride)
 
 
 convolve_2d.defvjp(_forward, _backward)
 
 
-def _kernel_gradient(x: Array, gradient: Array, *, size: tuple[int, int], padding: Padding, stride: int) -> Array:
+def _kernel_gradients(x: Array, gradient: Array, kernel: Array, padding: Padding, stride: int) -> Array:
+    """Gradient of the kernel of a convolution of x, from that of its result."""
+
+    def whole(x: Array, gradient: Array) -> Array:
+        convolve = partial(convolve_2d.fun, x, padding=padding, stride=stride)
+        (to_kernel,) = jax.linear_transpose(convolve, kernel)(gradient)
+        return to_kernel
+
+    if gradient.shape[0] * gradient.shape[1] * gradient.shape[2] <= _FEW_CELLS:
+        return whole(x, gradient)
+    size = (kernel.shape[0], kernel.shape[1])
+    blocked = partial(_blocked_kernel_gradient, size=size, padding=padding, stride=stride)
+    return lax.platform_dependent(x, gradient, cpu=blocked, default=whole)
+
+
+def _blocked_kernel_gradient(
+    x: Array, gradient: Array, *, size: tuple[int, int], padding: Padding, stride: int
+) -> Array:
     """For each tap (i, j) the sum over cells of x[b, stride r + i, stride q + j]^T gradient[b, r, q]."""
     batch, height, width, out = gradient.shape
+    taps = size[0] * size[1]
     channels, accumulator = x.shape[-1], jnp.promote_types(x.dtype, jnp.float32)
     rows = max(n for n in range(1, height + 1) if height % n == 0 and (n == 1 or n * batch * width <= _BLOCK_CELLS))
     x = jnp.pad(x, ((0, 0), *padding, (0, 0)))
@@ -68,34 +81,46 @@ def _kernel_gradient(x: Array, gradient: Array, *, size: tuple[int, int], paddin
     def accumulate(block: Array, total: Array) -> Array:
         part = lax.dynamic_slice_in_dim(gradient, block * rows, rows, axis=1).reshape(-1, out)
 
-        def multiply(i: int, j: int) -> Array:
-            cells = lax.dynamic_slice(x, (0, block * rows * stride + i, j, 0), spans)[:, ::stride, ::stride]
-            return jnp.matmul(
-                cells.reshape(-1, channels).T,
-                part,
-                precision=lax.Precision.HIGHEST,
-                preferred_element_type=accumulator,
-            )
+        def add_tap(tap: Array, total: Array) -> Array:
+            i = lax.div(tap, size[1])
+            start = (0, block * rows * stride + i, tap - i * size[1], 0)
+            cells = lax.dynamic_slice(x, start, spans)[:, ::stride, ::stride].reshape(-1, channels)
+            product = jnp.matmul(cells.T, part, precision=lax.Precision.HIGHEST, preferred_element_type=accumulator)
+            return total.at[tap].add(product)
 
-        return total + jnp.stack([multiply(i, j) for i in range(size[0]) for j in range(size[1])])
+        return lax.fori_loop(0, taps, add_tap, total)
 
-    zero = jnp.zeros((size[0] * size[1], channels, out), accumulator)
+    zero = jnp.zeros((taps, channels, out), accumulator)
     total = lax.fori_loop(0, height // rows, accumulate, zero)
     return total.reshape(*size, channels, out).astype(x.dtype)
 
 
+@jax.custom_vjp
 def upsample_2d(x: Float[Array, "B H W C"], kernel: Float[Array, "3 3 C O"]) -> Float[Array, "B H2 W2 O"]:
     """Transposed convolution of stride 2, padding 1, output padding 1, as four phase convolutions.
 
     out[2i - 1 + k] += in[i] * kernel[k] per axis: an even output row reads the middle tap alone, an odd one the outer
-    two.
+    two. The backward pass is the strided convolution that this transposes.
     """
-    taps = {0: (1,), 1: (2, 0)}
+    taps = (slice(1, 2), slice(2, None, -2))
 
     def phase(odd_y: int, odd_x: int) -> Array:
-        part = kernel[jnp.array(taps[odd_y])][:, jnp.array(taps[odd_x])]
-        return convolve_2d(x, part, ((0, odd_y), (0, odd_x)))
+        return convolve_2d.fun(x, kernel[taps[odd_y], taps[odd_x]], ((0, odd_y), (0, odd_x)), 1)
 
     rows = [jnp.stack([phase(y, 0), phase(y, 1)], 3) for y in (0, 1)]
     batch, height, width, _ = x.shape
     return jnp.stack(rows, 2).reshape(batch, 2 * height, 2 * width, -1)
+
+
+def _upsample_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
+    return upsample_2d.fun(x, kernel), (x, kernel)
+
+
+def _upsample_backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+    x, kernel = saved
+    padding, transposed = ((1, 0), (1, 0)), jnp.swapaxes(kernel, 2, 3)
+    to_kernel = _kernel_gradients(gradient, x, transposed, padding, 2)
+    return convolve_2d.fun(gradient, transposed, padding, 2), jnp.swapaxes(to_kernel, 2, 3)
+
+
+upsample_2d.defvjp(_upsample_forward, _upsample_backward)

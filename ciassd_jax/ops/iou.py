@@ -37,29 +37,39 @@ def intersection_bev(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
         (x + ux + vx, y + uy + vy),
         (x - ux + vx, y - uy + vy),
     ]
-    steps = [(2 * ux, 2 * uy), (2 * vx, 2 * vy), (-2 * ux, -2 * uy), (-2 * vx, -2 * vy)]
+    # The edges of `b` as (step, 1 / step) in x and y: two of them and their opposites, so that four divisions do.
+    along, across = [[(2 * step, _inverse(xp, 2 * step)) for step in edge] for edge in ((ux, uy), (vx, vy))]
+    back, home = [[(-step, -inverse) for step, inverse in edge] for edge in (along, across)]
 
     twice = xp.zeros_like(x + p + u)
     # The part of each edge of `a` on x = +-p and y = +-q that is inside b, as [low, high] and a weight.
     on_x = [[-q, q, 1.0], [-q, q, 1.0]]
     on_y = [[-p, p, 1.0], [-p, p, 1.0]]
-    for (sx, sy), (ex, ey) in zip(starts, steps, strict=True):
-        low_x, high_x, weight_x = _clip(xp, sx, ex, sy, ey, p, on_x, left=-1)
-        low_y, high_y, weight_y = _clip(xp, sy, ey, sx, ex, q, on_y, left=1)
+    for (sx, sy), (step_x, step_y) in zip(starts, (along, across, back, home), strict=True):
+        low_x, high_x, weight_x = _clip(xp, sx, step_x, sy, step_y[0], p, on_x, left=-1)
+        low_y, high_y, weight_y = _clip(xp, sy, step_y, sx, step_x[0], q, on_y, left=1)
         low = xp.maximum(xp.maximum(low_x, low_y), 0)
         high = xp.minimum(xp.minimum(high_x, high_y), 1)
-        twice = twice + xp.maximum(high - low, 0) * weight_x * weight_y * (sx * ey - sy * ex)
+        cross = sx * step_y[0] - sy * step_x[0]
+        twice = twice + xp.maximum(high - low, 0) * weight_x * weight_y * cross
     for half, edges in ((p, on_x), (q, on_y)):
         for low, high, weight in edges:
             twice = twice + xp.maximum(high - low, 0) * weight * half
-    # A point has edges without direction, of which no side is outside.
+    # Zero-area boxes pass every clip test; their overlap is set to 0.
     return xp.where(u * v == 0, 0, xp.maximum(twice, 0) / 2)
+
+
+def _inverse(xp: ModuleType, step: Array) -> Array:
+    """1 / step, and 0 for an edge that is parallel to the lines it is clipped by."""
+    # The reciprocal of a smaller number is not finite.
+    parallel = xp.abs(step) < np.finfo(step.dtype).tiny
+    return xp.where(parallel, 0, 1 / xp.where(parallel, 1, step))
 
 
 def _clip(
     xp: ModuleType,
     s: Array,
-    e: Array,
+    step: tuple[Array, Array],
     s_other: Array,
     e_other: Array,
     half: Array,
@@ -69,14 +79,14 @@ def _clip(
     """Clip the edge s + t * e to |.| <= half, and the edges of `a` on these two lines to its left side.
 
     Returns the range of t and the weight of the edge; narrows `edges` = [at -half, at +half] in place. `left` is
-    +1 where growing `e` bounds the other coordinate from above, else -1.
+    +1 where growing `e` bounds the other coordinate from above, else -1. `step` is (e, 1 / e).
     """
-    parallel = e == 0
-    safe = xp.where(parallel, 1, e)
+    e, inverse = step
+    parallel = inverse == 0
     crossings = []
     weight: Array | float = 1.0
     for line, edge in zip((-half, half), edges, strict=True):
-        t = (line - s) / safe
+        t = (line - s) * inverse
         crossings.append(t)
         at = s_other + t * e_other
         grows = left * e > 0

@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from ciassd_jax.ops.iou import iou_bev
+from ciassd_jax.ops.rows import take_rows
 from ciassd_jax.types import Array, Boxes, Candidates
 
 _BLOCK_ROWS = 64
@@ -142,7 +143,7 @@ def refine_by_anchor_distance(candidates: Candidates) -> Candidates:
     """
     score = candidates.score * (1 - _masked_softmax(candidates.anchor_distance, candidates.valid))
     order = jnp.argsort(jnp.where(candidates.valid, score, -jnp.inf), descending=True, stable=True)
-    return jax.tree.map(lambda leaf: leaf[order], candidates._replace(score=score))
+    return take_rows(candidates._replace(score=score), order)
 
 
 def _class_overlap(candidates: Candidates) -> tuple[Float[Array, "K K"], Bool[Array, "K K"]]:

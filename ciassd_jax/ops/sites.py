@@ -29,30 +29,31 @@ def linear_keys(coordinates: Int[Array, "*n 3"], shape: Triple) -> Int[Array, "*
 def coordinates_of(keys: Int[Array, "*n"], shape: Triple) -> Int[Array, "*n 3"]:
     """Inverse of `linear_keys`: (z, y, x)."""
     depth, _, width = shape
-    column = keys // depth
-    return jnp.stack([keys % depth, column // width, column % width], -1)
+    column = _quotient(keys, depth)
+    y = _quotient(column, width)
+    return jnp.stack([keys - column * depth, y, column - y * width], -1)
+
+
+def _quotient(values: Int[Array, "*n"], divisor: int) -> Int[jax.Array, "*n"]:
+    """values // divisor of values that are not negative: without a sign it is a single operation."""
+    return lax.div(jnp.asarray(values), jnp.asarray(divisor, values.dtype))
 
 
 def active_sites(keys: Int[Array, " V"], *, shape: Triple) -> Sites:
     """Sites of ascending distinct keys; `NO_SITE` marks padding and comes last."""
     depth, height, width = shape
     words, slots = -(-depth // 32), keys.shape[0]
-    column, z = keys // depth, keys % depth
-    word = jnp.arange(words, dtype=jnp.int32)[None]
-    bits = jnp.where((z // 32)[:, None] == word, _bit(z % 32)[:, None], jnp.uint32(0))
-    # Gather the bits of a column in its first site: its sites are adjacent, at most `depth` of them.
-    for step in (2**i for i in range((depth - 1).bit_length())):
-        same = jnp.pad(column[step:], (0, min(step, slots)), constant_values=-1)[:slots] == column
-        later = jnp.pad(bits[step:], ((0, min(step, slots)), (0, 0)))[:slots]
-        bits = bits | jnp.where(same[:, None], later, jnp.uint32(0))
-    slot = jnp.arange(slots, dtype=jnp.int32)
-    is_first = (column != jnp.concatenate([jnp.full(1, -1, jnp.int32), column[:-1]])) & (keys != NO_SITE)
-    # Each other slot writes to a place of its own outside of the map, where it is dropped.
-    place = jnp.where(is_first, column, height * width + slot)
-    entry = jnp.concatenate([bits, slot.astype(jnp.uint32)[:, None]], 1)
+    real = keys != NO_SITE
+    # Padding is dropped outside of the map.
+    column = _quotient(keys, depth)
+    bits = _bits_of(keys - column * depth, words)
+    column = jnp.where(real, column, height * width)
+    # A column's bits are distinct, so that their sum is their OR; its slot is that of its first site.
+    first = column != jnp.concatenate([jnp.full(1, -1, jnp.int32), column[:-1]])
+    start = jnp.where(first, jnp.arange(slots, dtype=jnp.uint32), 0)
     columns = jnp.zeros((height * width, words + 1), jnp.uint32)
-    columns = columns.at[place].set(entry, mode="drop", unique_indices=True)
-    return Sites(keys, (keys != NO_SITE).sum(dtype=jnp.int32), columns)
+    columns = columns.at[column].add(jnp.concatenate([bits, start[:, None]], 1), mode="drop", indices_are_sorted=True)
+    return Sites(keys, real.sum(dtype=jnp.int32), columns)
 
 
 def strided_sites(
@@ -95,16 +96,44 @@ def _any_in_window(
 def _any_in_depth(
     bits: UInt32[Array, "Y X W"], depth: int, size: int, kernel: int, stride: int, padding: int
 ) -> UInt32[jax.Array, "Y X W2"]:
-    """Mask of the `size` outputs along z whose window holds a set bit."""
-    result = [jnp.zeros(bits.shape[:2], jnp.uint32) for _ in range(-(-size // 32))]
-    for output in range(size):
-        start = output * stride - padding
-        window = range(max(start, 0), min(start + kernel, depth))
-        hit = jnp.zeros(bits.shape[:2], bool)
-        for word in {z // 32 for z in window}:
-            hit |= (bits[..., word] & np.uint32(sum(1 << z % 32 for z in window if z // 32 == word))) != 0
-        result[output // 32] |= jnp.where(hit, np.uint32(1 << output % 32), np.uint32(0))
+    """Mask of the `size` outputs along z whose window holds a set bit; strides of 1 and 2."""
+    assert stride in (1, 2), f"a mask cannot be strided by {stride}"
+    words = [jnp.asarray(bits[..., i]) for i in range(bits.shape[-1])]
+    # Bit z + padding of the first mask, then bit z of the others, is the input z: outputs start at -padding.
+    words = _shift_up([*words, jnp.zeros_like(words[0])], padding)
+    window = words
+    for offset in range(1, kernel):
+        window = [a | b for a, b in zip(window, _shift_down(words, offset), strict=True)]
+    if stride == 2:
+        halves = [_even_bits(word) for word in [*window, jnp.zeros_like(words[0])]]
+        window = [low | (high << 16) for low, high in zip(halves[::2], halves[1::2], strict=False)]
+    result = []
+    for i in range(-(-size // 32)):
+        outputs = min(size - 32 * i, 32)
+        result.append(window[i] & np.uint32(2**outputs - 1))
     return jnp.stack(result, -1)
+
+
+def _shift_up(words: list[jax.Array], bits: int) -> list[jax.Array]:
+    """The mask moved to higher bits across words, by less than 32."""
+    if bits == 0:
+        return words
+    lower = [jnp.zeros_like(words[0]), *words[:-1]]
+    return [(word << bits) | (below >> (32 - bits)) for word, below in zip(words, lower, strict=True)]
+
+
+def _shift_down(words: list[jax.Array], bits: int) -> list[jax.Array]:
+    """The mask moved to lower bits across words, by 1 to 31."""
+    higher = [*words[1:], jnp.zeros_like(words[0])]
+    return [(word >> bits) | (above << (32 - bits)) for word, above in zip(words, higher, strict=True)]
+
+
+def _even_bits(word: jax.Array) -> jax.Array:
+    """Bits 0, 2, 4, ... of a word, packed into its lower half."""
+    word = word & np.uint32(0x55555555)
+    for shift, mask in ((1, 0x33333333), (2, 0x0F0F0F0F), (4, 0x00FF00FF), (8, 0x0000FFFF)):
+        word = (word | (word >> shift)) & np.uint32(mask)
+    return word
 
 
 def _list_sites(bits: UInt32[Array, "columns W"], *, depth: int, capacity: int) -> tuple[Sites, Int[Array, ""]]:
@@ -116,38 +145,46 @@ def _list_sites(bits: UInt32[Array, "columns W"], *, depth: int, capacity: int) 
     # A column marks the slot of its lowest site; the slots of its other sites follow.
     place = jnp.where((number > 0) & (start < capacity), start, capacity + column)
     first = jnp.zeros(capacity, jnp.int32).at[place].set(column, mode="drop", unique_indices=True)
-    column_of = lax.cummax(first)
+    # The largest column so far; a column has at most `depth` sites, so that it is among the last `depth` slots.
+    column_of = lax.reduce_window(first, np.int32(0), lax.max, (depth,), (1,), ((depth - 1, 0),))
     slot = jnp.arange(capacity, dtype=jnp.int32)
-    z = _nth_bit(bits[column_of], slot - start[column_of], depth)
+    # Known once: without the barrier it is fused into every neighbour table and computed again for each entry.
+    z = lax.optimization_barrier(_nth_bit(bits[column_of], slot - start[column_of]))
     real = slot < found
     keys = jnp.where(real, column_of * depth + z, NO_SITE)
     # Sites over capacity leave the map too; the last column that stays may lose only some of its own.
     last = column_of[-1]
-    word = jnp.arange(bits.shape[1], dtype=jnp.int32)[None]
-    mine = (real & (column_of == last))[:, None] & ((z // 32)[:, None] == word)
-    trimmed = jnp.where((start < capacity)[:, None], bits, jnp.uint32(0))
-    trimmed = trimmed.at[last].set(jnp.where(mine, _bit(z % 32)[:, None], jnp.uint32(0)).sum(0, dtype=jnp.uint32))
+    mine = (real & (column_of == last))[:, None]
+    of_last = jnp.where(mine, _bits_of(z, bits.shape[1]), jnp.uint32(0)).sum(0, dtype=jnp.uint32)
+    trimmed = jnp.where((column == last)[:, None], of_last[None], bits)
+    trimmed = jnp.where((start < capacity)[:, None], trimmed, jnp.uint32(0))
     columns = jnp.concatenate([trimmed, start.astype(jnp.uint32)[:, None]], 1)
     count = jnp.minimum(found, capacity)
     return Sites(keys, count, columns), found - count
 
 
-def _nth_bit(bits: UInt32[Array, "V W"], n: Int[Array, " V"], depth: int) -> Int[Array, " V"]:
-    """Place of the n-th set bit (from 0) of each mask; `depth` where there are fewer."""
+def _nth_bit(bits: UInt32[Array, "V W"], n: Int[Array, " V"]) -> Int[Array, " V"]:
+    """Place of the n-th set bit (from 0) of each mask, which has as many."""
+    word, place = bits[:, 0], jnp.zeros_like(n)
+    for i in range(1, bits.shape[1]):
+        below = lax.population_count(word).astype(jnp.int32)
+        beyond = n >= below
+        # `word` stays the word in which the bit is looked for, `n` its rank there.
+        word, place = jnp.where(beyond, bits[:, i], word), jnp.where(beyond, 32 * i, place)
+        n = jnp.where(beyond, n - below, n)
+    for width in (16, 8, 4, 2, 1):
+        below = lax.population_count(word & np.uint32(2**width - 1)).astype(jnp.int32)
+        beyond = n >= below
+        word, place = jnp.where(beyond, word >> width, word), jnp.where(beyond, place + width, place)
+        n = jnp.where(beyond, n - below, n)
+    return place
 
-    def count(z: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        seen, place = state
-        word = lax.dynamic_index_in_dim(bits, z // 32, 1, keepdims=False)
-        seen = seen + ((word >> jnp.asarray(z % 32).astype(jnp.uint32)) & 1).astype(jnp.int32)
-        return seen, place + (seen <= n).astype(jnp.int32)
 
-    # A loop, as unrolled it would be fused into every neighbour table and computed again for each entry.
-    none = jnp.zeros(n.shape, jnp.int32)
-    return lax.fori_loop(0, depth, count, (none, none))[1]
-
-
-def _bit(z: Int[Array, "*n"]) -> UInt32[Array, "*n"]:
-    return jnp.uint32(1) << jnp.asarray(z).astype(jnp.uint32)
+def _bits_of(z: Int[Array, " V"], words: int) -> UInt32[Array, "V W"]:
+    """The mask of a column in which only z is set."""
+    word = jnp.arange(words, dtype=jnp.int32)[None]
+    bit = jnp.uint32(1) << (z & 31).astype(jnp.uint32)
+    return jnp.where((z >> 5)[:, None] == word, bit[:, None], jnp.uint32(0))
 
 
 def slots_at(
@@ -163,20 +200,18 @@ def slots_at(
     inside = _within(y, height)[:, :, None] & _within(x, width)[:, None]
     column = jnp.where(inside, y[:, :, None] * width + x[:, None], 0)
     entry = jnp.asarray(sites.columns).at[column].get(mode="promise_in_bounds")
-    words, start = entry[..., :-1], entry[..., -1].astype(jnp.int32)
-    found = []
-    for k in range(z.shape[1]):
-        here = z[:, k, None, None]
-        at = jnp.where(_within(here, depth), here, 0)
-        below, active = jnp.zeros(start.shape, jnp.int32), jnp.zeros(start.shape, bool)
-        for i in range(words.shape[-1]):
-            bit = (at - 32 * i).clip(0, 31).astype(jnp.uint32)
-            lower = jnp.where(at < 32 * (i + 1), (jnp.uint32(1) << bit) - 1, jnp.uint32(0xFFFFFFFF))
-            lower = jnp.where(at < 32 * i, jnp.uint32(0), lower)
-            below += lax.population_count(words[..., i] & lower).astype(jnp.int32)
-            active |= (at // 32 == i) & ((words[..., i] >> bit) & 1 == 1)
-        found.append(jnp.where(active & inside & _within(here, depth), start + below, slots))
-    return jnp.stack(found, 1).reshape(z.shape[0], -1)
+    words, start = entry[:, None, ..., :-1], entry[:, None, ..., -1].astype(jnp.int32)
+    here = z[:, :, None, None]
+    at = jnp.where(_within(here, depth), here, 0)
+    below, active = jnp.zeros((1,) * 4, jnp.int32), jnp.zeros((1,) * 4, bool)
+    for i in range(words.shape[-1]):
+        bit = (at - 32 * i).clip(0, 31).astype(jnp.uint32)
+        lower = jnp.where(at < 32 * (i + 1), (jnp.uint32(1) << bit) - 1, jnp.uint32(0xFFFFFFFF))
+        lower = jnp.where(at < 32 * i, jnp.uint32(0), lower)
+        below += lax.population_count(words[..., i] & lower).astype(jnp.int32)
+        active |= (at >> 5 == i) & ((words[..., i] >> bit) & 1 == 1)
+    found = active & inside[:, None] & _within(here, depth)
+    return jnp.where(found, start + below, slots).reshape(z.shape[0], -1)
 
 
 def _within(index: Int[Array, "*n"], size: int) -> Bool[Array, "*n"]:

@@ -1,13 +1,13 @@
-"""Sparse 3D convolution with static shapes (paper section 3.1, SPEC section 4).
+"""Sparse 3D convolution with static shapes (paper section 3.1).
 
-A scene is a grid (z, y, x) in which only active sites exist (`sites.py`). A neighbour table says which input each
-kernel offset reads; a convolution is a gather through it and one matrix product for each block of rows, in value and
-in gradient. `sparse_dense.py` holds the definition that this must equal.
+A scene is a grid (z, y, x) in which only active sites exist (`sites.py`). A neighbour table lists the input site under
+each kernel offset of each output site. A convolution gathers its inputs through the table and multiplies them with the
+kernel, and so does its gradient. `sparse_dense.py` holds the definition that this must equal.
 """
 
 from __future__ import annotations
 
-from functools import partial, wraps
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,16 +19,15 @@ from jaxtyping import Float, Int
 from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of, slots_at, zeros_after
 from ciassd_jax.types import Array, NeighbourTable, Sites
 
-# Rows of the output computed at once. On a CPU the gathered block must stay in cache; elsewhere large
-# products matter more.
-_BLOCK_ROWS = {"cpu": 2000, "default": 32000}
+# Rows that a CPU gathers and multiplies at once: the gathered block must stay in cache.
+_BLOCK_ROWS = 2000
 
 
 def submanifold_table(sites: Sites, *, shape: Triple) -> NeighbourTable:
     """Neighbours of a 3 x 3 x 3 submanifold convolution, offsets in C order (z, y, x)."""
     inputs = _inputs(sites, sites, shape=shape, out_shape=shape, kernel=(3, 3, 3), stride=(1, 1, 1), padding=(1, 1, 1))
-    # Who reads me through offset k is whom I read through the mirrored offset.
-    return NeighbourTable(inputs, inputs[:, ::-1])
+    # The transposed table is the table with its offsets reversed.
+    return NeighbourTable(inputs, inputs[:, ::-1], sites.count, sites.count)
 
 
 def strided_table(
@@ -43,7 +42,8 @@ def strided_table(
 ) -> NeighbourTable:
     """Neighbours of a strided convolution from `sites` to `out_sites`, offsets in C order (z, y, x)."""
     geometry = {"shape": shape, "out_shape": out_shape, "kernel": kernel, "stride": stride, "padding": padding}
-    return NeighbourTable(_inputs(sites, out_sites, **geometry), _outputs(sites, out_sites, **geometry))
+    inputs, outputs = _inputs(sites, out_sites, **geometry), _outputs(sites, out_sites, **geometry)
+    return NeighbourTable(inputs, outputs, out_sites.count, sites.count)
 
 
 def _inputs(
@@ -62,11 +62,13 @@ def _outputs(
     sites: Sites, out_sites: Sites, *, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple
 ) -> Int[Array, "U K"]:
     """Slots of the outputs at (i + padding - k) / stride of every input i, where that is whole."""
+    assert set(stride) <= {1, 2}, f"the stride {stride} is not 1 or 2 along each axis"
     real = (sites.keys != NO_SITE)[:, None]
     axes = []
     for i, k, s, p in zip(coordinates_of(sites.keys, shape).T, kernel, stride, padding, strict=True):
         shifted = i[:, None] + p - jnp.arange(k, dtype=jnp.int32)[None]
-        axes.append(jnp.where(real & (shifted % s == 0), shifted // s, -1))
+        # A shift halves negative numbers downwards.
+        axes.append(jnp.where(real & (shifted & (s - 1) == 0), shifted >> (s - 1), -1))
     return slots_at(out_sites, *axes, shape=out_shape)
 
 
@@ -78,7 +80,9 @@ def flatten_scenes(table: NeighbourTable) -> NeighbourTable:
         first = slots * jnp.arange(scenes, dtype=jnp.int32)[:, None, None]
         return jnp.where(index < slots, index + first, scenes * slots).reshape(-1, index.shape[-1])
 
-    return NeighbourTable(flatten(table.inputs, table.outputs.shape[1]), flatten(table.outputs, table.inputs.shape[1]))
+    inputs = flatten(table.inputs, table.outputs.shape[1])
+    outputs = flatten(table.outputs, table.inputs.shape[1])
+    return NeighbourTable(inputs, outputs, table.num_outputs, table.num_inputs)
 
 
 @jax.custom_vjp
@@ -87,23 +91,31 @@ def convolve(
 ) -> Float[Array, "V O"]:
     """Sparse convolution (cross-correlation, no bias): out[v] = sum_k features[table.inputs[v, k]] @ kernel[k].
 
-    Rows without neighbours are zero and cost nothing. The backward pass gathers through `table.outputs`; nothing
-    is scattered, so that results repeat bit for bit on every device. Accumulates in float32 or wider.
+    Rows without neighbours are zero. The backward pass gathers through `table.outputs`; nothing is scattered, so that
+    results repeat bit for bit on every device. Accumulates in float32 or wider.
     """
-    return _gather_multiply(features, table.inputs, kernel)
+    return _multiply_on_platform(features, table, kernel)
+
+
+def _multiply_on_platform(features: Array, table: NeighbourTable, kernel: Array) -> jax.Array:
+    operands = (features, table.inputs, table.num_outputs, kernel)
+    return jnp.asarray(lax.platform_dependent(*operands, cpu=_multiply_blocks, default=_multiply))
 
 
 def _convolve_forward(
     features: Float[Array, "U C"], table: NeighbourTable, kernel: Float[Array, "K C O"]
 ) -> tuple[Float[Array, "V O"], tuple[Array, NeighbourTable, Array]]:
-    return _gather_multiply(features, table.inputs, kernel), (features, table, kernel)
+    return _multiply_on_platform(features, table, kernel), (features, table, kernel)
 
 
 def _convolve_backward(
     saved: tuple[Array, NeighbourTable, Array], gradient: Float[Array, "V O"]
 ) -> tuple[Array, NeighbourTable, Array]:
     features, table, kernel = saved
-    to_features, to_kernel = _gradients(gradient, table.outputs, jnp.swapaxes(kernel, 1, 2), features)
+    transposed = jnp.swapaxes(kernel, 1, 2)
+    to_features, to_kernel = lax.platform_dependent(
+        gradient, table.outputs, table.num_inputs, transposed, features, cpu=_gradients_blocks, default=_gradients
+    )
     no_gradient = NeighbourTable(*(np.zeros(t.shape, jax.dtypes.float0) for t in table))
     return to_features, no_gradient, to_kernel
 
@@ -111,94 +123,127 @@ def _convolve_backward(
 convolve.defvjp(_convolve_forward, _convolve_backward)
 
 
-def _per_platform(function):  # type: ignore[no-untyped-def]
-    """Run `function(*arrays, rows=...)` with the block size of the platform that it is lowered for."""
-
-    @wraps(function)
-    def choose(*arrays: Array) -> Any:
-        branches = {name: partial(function, rows=rows) for name, rows in _BLOCK_ROWS.items()}
-        return lax.platform_dependent(*arrays, **branches)
-
-    return choose
+def _product(a: Array, b: Array, dtype: jnp.dtype) -> jax.Array:
+    """Matrix product in full precision, accumulated in float32 or wider."""
+    accumulator = jnp.promote_types(dtype, jnp.float32)
+    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST, preferred_element_type=accumulator)
 
 
-def _even_rows(slots: int, most: int) -> int:
-    """At most `most` rows in as few blocks of one size as they need: often no row is left to pad."""
-    return -(-slots // -(-slots // most))
+def _with_zero_row(rows: Float[Array, "U C"]) -> Float[jax.Array, "U1 C"]:
+    """The rows and one of zeros, which absent neighbours read."""
+    return jnp.pad(rows, ((0, 1), (0, 0)))
 
 
-def _accumulator(dtype: jnp.dtype) -> jnp.dtype:
-    return jnp.promote_types(dtype, jnp.float32)
+def _real_rows(values: Array, count: Int[Array, "*b"]) -> Array:
+    """The rows of real sites, zero elsewhere: padding slots may hold anything."""
+    real = jnp.arange(values.shape[0] // count.size, dtype=jnp.int32)[None] < count.reshape(-1, 1)
+    return jnp.where(real.reshape(-1, 1), values, 0)
 
 
-def _blocks(index: Int[Array, "V K"], absent: int, rows: int) -> tuple[Array, Array, Array]:
-    """The table padded to whole blocks, the blocks with the occupied ones first, and how many those are."""
-    padding = -index.shape[0] % rows
-    index = jnp.pad(index, ((0, padding), (0, 0)), constant_values=absent)
-    occupied = (index < absent).reshape(-1, rows * index.shape[1]).any(1)
-    return index, jnp.argsort(~occupied, stable=True).astype(jnp.int32), occupied.sum(dtype=jnp.int32)
+# All rows at once, for accelerators.
 
 
-def _gathered(features: Float[Array, "U1 C"], index: Int[Array, "V K"], start: Array, rows: int) -> Array:
-    """The inputs of one block of rows, [rows, K * C]; the last feature row is zero and stands for 'none'."""
-    columns, channels = index.shape[1], features.shape[1]
-
-    def gather(start: Array) -> Array:
-        block = lax.dynamic_slice_in_dim(index, start, rows).reshape(-1)
-        return jnp.asarray(features).at[block].get(mode="promise_in_bounds")
-
-    # Always true. XLA does not fuse across a branch: fused with the reshape, a CPU gathers one float at a time.
-    whole = lax.cond(start >= 0, gather, lambda _: jnp.zeros((rows * columns, channels), features.dtype), start)
-    return whole.reshape(rows, -1)
+def _multiply(features: Array, index: Array, count: Array, kernel: Array) -> Array:
+    gathered = _with_zero_row(features).at[index].get(mode="promise_in_bounds").reshape(index.shape[0], -1)
+    return _product(gathered, kernel.reshape(-1, kernel.shape[-1]), features.dtype).astype(features.dtype)
 
 
-@_per_platform
-def _gather_multiply(features: Array, index: Array, kernel: Array, *, rows: int) -> Array:
-    slots, out = index.shape[0], kernel.shape[-1]
-    rows = _even_rows(slots, rows)
-    index, order, occupied = _blocks(index, features.shape[0], rows)
-    padded = jnp.pad(features, ((0, 1), (0, 0)))
-    kernel = kernel.reshape(-1, out)
-
-    def multiply(i: Array, result: Array) -> Array:
-        start = order[i] * rows
-        product = jnp.matmul(
-            _gathered(padded, index, start, rows),
-            kernel,
-            precision=lax.Precision.HIGHEST,
-            preferred_element_type=_accumulator(features.dtype),
-        )
-        return lax.dynamic_update_slice_in_dim(result, product.astype(features.dtype), start, 0)
-
-    empty = zeros_after(occupied, (index.shape[0], out), features.dtype)
-    return lax.fori_loop(jnp.int32(0), occupied, multiply, empty)[:slots]
-
-
-@_per_platform
-def _gradients(gradient: Array, index: Array, kernel: Array, features: Array, *, rows: int) -> tuple[Array, Array]:
+def _gradients(gradient: Array, index: Array, count: Array, kernel: Array, features: Array) -> tuple[Array, Array]:
     """Gradients of features and kernel [K, C, O] from the output's, of which one gather serves both.
 
-    `index` [U, K] says which outputs read a feature row, and `kernel` is [K, O, C].
+    `index` [U, K] lists the outputs that read a feature row, and `kernel` is [K, O, C].
     """
-    slots, columns, (out, channels) = features.shape[0], index.shape[1], kernel.shape[1:]
-    rows = _even_rows(slots, rows)
-    index, order, occupied = _blocks(index, gradient.shape[0], rows)
-    padded = jnp.pad(gradient, ((0, 1), (0, 0)))
-    # Padding slots may hold anything, and nobody reads them.
-    read = jnp.any(index < gradient.shape[0], 1, keepdims=True)
-    features = jnp.where(read, jnp.pad(features, ((0, index.shape[0] - slots), (0, 0))), 0)
-    multiply = partial(jnp.matmul, precision=lax.Precision.HIGHEST, preferred_element_type=_accumulator(features.dtype))
-
-    def accumulate(i: Array, results: tuple[Array, Array]) -> tuple[Array, Array]:
-        to_features, to_kernel = results
-        start = order[i] * rows
-        gathered = _gathered(padded, index, start, rows)
-        block = multiply(gathered, kernel.reshape(-1, channels)).astype(features.dtype)
-        to_features = lax.dynamic_update_slice_in_dim(to_features, block, start, 0)
-        return to_features, to_kernel + multiply(lax.dynamic_slice_in_dim(features, start, rows).T, gathered)
-
-    empty = zeros_after(occupied, features.shape, features.dtype)
-    zero = jnp.zeros((channels, columns * out), _accumulator(features.dtype))
-    to_features, to_kernel = lax.fori_loop(jnp.int32(0), occupied, accumulate, (empty, zero))
+    columns, out, channels = kernel.shape
+    gathered = _with_zero_row(gradient).at[index].get(mode="promise_in_bounds").reshape(index.shape[0], -1)
+    to_features = _product(gathered, kernel.reshape(-1, channels), features.dtype)
+    to_kernel = _product(_real_rows(features, count).T, gathered, features.dtype)
     to_kernel = to_kernel.reshape(channels, columns, out).transpose(1, 0, 2)
-    return to_features[:slots], to_kernel.astype(kernel.dtype)
+    return to_features.astype(features.dtype), to_kernel.astype(kernel.dtype)
+
+
+# Block after block of the real rows of each scene, for a CPU.
+
+
+class _Blocks:
+    """The rows of a table in blocks of one size, scene after scene."""
+
+    def __init__(self, index: Array, count: Array) -> None:
+        scenes, slots = count.size, index.shape[0] // count.size
+        # As few blocks as needed, of the same size: often no row is left to pad.
+        self.rows = -(-slots // -(-slots // _BLOCK_ROWS))
+        self.scenes, self.slots, self.padded = scenes, slots, -(-slots // self.rows) * self.rows
+        self.count = count.reshape(-1)
+        self.always = self.count[0] >= 0
+
+    def pad(self, array: Array, value: int = 0) -> Array:
+        """An array of rows with every scene padded to whole blocks."""
+        if self.padded == self.slots:
+            return array
+        by_scene = array.reshape(self.scenes, self.slots, -1)
+        by_scene = jnp.pad(by_scene, ((0, 0), (0, self.padded - self.slots), (0, 0)), constant_values=value)
+        return by_scene.reshape(self.scenes * self.padded, -1)
+
+    def crop(self, array: Array) -> Array:
+        """Inverse of `pad`."""
+        if self.padded == self.slots:
+            return array
+        return array.reshape(self.scenes, self.padded, -1)[:, : self.slots].reshape(self.scenes * self.slots, -1)
+
+    def accumulate(self, step: Callable[[Array, Any], Any], start: Any) -> Any:
+        """Run step(first row, carry) for every block that holds a real row."""
+
+        def each_scene(scene: Array, carry: Any) -> Any:
+            first = scene * self.padded
+            last = first + self.count[scene]
+            block = lambda state: (state[0] + self.rows, step(*state))  # noqa: E731
+            return lax.while_loop(lambda state: state[0] < last, block, (first, carry))[1]
+
+        return lax.fori_loop(0, self.scenes, each_scene, start)
+
+    def gather(self, rows: Array, index: Array, start: Array) -> Array:
+        """The neighbours of one block of rows, [rows, K * C]."""
+        size = self.rows * index.shape[1]
+
+        def gather(start: Array) -> Array:
+            block = lax.dynamic_slice_in_dim(index, start, self.rows).reshape(-1)
+            return jnp.asarray(rows).at[block].get(mode="promise_in_bounds")
+
+        # Always true. XLA does not fuse across a branch: fused with the reshape, a CPU gathers one float at a time.
+        whole = lax.cond(self.always, gather, lambda _: jnp.zeros((size, rows.shape[1]), rows.dtype), start)
+        return whole.reshape(self.rows, -1)
+
+
+def _multiply_blocks(features: Array, index: Array, count: Array, kernel: Array) -> Array:
+    blocks, out = _Blocks(index, count), kernel.shape[-1]
+    index, padded = blocks.pad(index, features.shape[0]), _with_zero_row(features)
+    kernel = kernel.reshape(-1, out)
+
+    def multiply(start: Array, result: Array) -> Array:
+        product = _product(blocks.gather(padded, index, start), kernel, features.dtype)
+        return lax.dynamic_update_slice_in_dim(result, product.astype(features.dtype), start, 0)
+
+    empty = zeros_after(blocks.count[0], (index.shape[0], out), features.dtype)
+    return blocks.crop(blocks.accumulate(multiply, empty))
+
+
+def _gradients_blocks(
+    gradient: Array, index: Array, count: Array, kernel: Array, features: Array
+) -> tuple[Array, Array]:
+    blocks, (columns, out, channels) = _Blocks(index, count), kernel.shape
+    index, padded = blocks.pad(index, gradient.shape[0]), _with_zero_row(gradient)
+    features = blocks.pad(_real_rows(features, count))
+    kernel_rows = kernel.reshape(-1, channels)
+
+    def accumulate(start: Array, results: tuple[Array, Array]) -> tuple[Array, Array]:
+        to_features, to_kernel = results
+        gathered = blocks.gather(padded, index, start)
+        block = _product(gathered, kernel_rows, features.dtype).astype(features.dtype)
+        to_features = lax.dynamic_update_slice_in_dim(to_features, block, start, 0)
+        rows = lax.dynamic_slice_in_dim(features, start, blocks.rows)
+        return to_features, to_kernel + _product(rows.T, gathered, features.dtype)
+
+    empty = zeros_after(blocks.count[0], features.shape, features.dtype)
+    zero = jnp.zeros((channels, columns * out), jnp.promote_types(features.dtype, jnp.float32))
+    to_features, to_kernel = blocks.accumulate(accumulate, (empty, zero))
+    to_kernel = to_kernel.reshape(channels, columns, out).transpose(1, 0, 2)
+    return blocks.crop(to_features), to_kernel.astype(kernel.dtype)

@@ -84,9 +84,10 @@ def voxelize(
     kept = is_first & (order < limit)
     rank = jnp.cumsum(kept, dtype=jnp.int32)
     count = rank[-1]
-    voxel = jnp.arange(max_voxels, dtype=jnp.int32)
-    real = voxel < count
-    start = jnp.minimum(jnp.searchsorted(rank, voxel + 1).astype(jnp.int32), capacity - 1)
+    real = jnp.arange(max_voxels, dtype=jnp.int32) < count
+    # Where each kept voxel begins in the sorted list; each other slot writes to a place of its own that is dropped.
+    place = jnp.where(kept, rank - 1, max_voxels + slots)
+    start = jnp.zeros(max_voxels, jnp.int32).at[place].set(slots, mode="drop", unique_indices=True)
     # Slots of the voxel's first points in the sorted list: they share its key.
     member = jnp.minimum(start[:, None] + jnp.arange(max_points, dtype=jnp.int32)[None], capacity - 1)
     distinct = start[:, None] + jnp.arange(max_points, dtype=jnp.int32)[None] < capacity
@@ -97,6 +98,10 @@ def voxelize(
     values = jnp.where(used[..., None], cloud.points[order[member]], 0)
     total = jnp.broadcast_to(jnp.maximum(num_points, 1).astype(values.dtype)[:, None], values[:, 0].shape)
     in_range = inside.sum(dtype=jnp.int32)
+    # The voxel kept last before a point in the list is the point's own, or the point's was dropped.
+    in_kept = (keys != NO_SITE) & (count > 0) & (keys == keys[start][jnp.maximum(rank - 1, 0)])
+    if overflow == "stop":
+        in_kept &= order < limit
     return SparseVoxels(
         features=values.sum(1) / total,
         coordinates=jnp.where(real[:, None], coordinates_of(keys[start], shape), 0),
@@ -105,19 +110,5 @@ def voxelize(
         count=count,
         dropped=touched - count,
         points_in_range=in_range,
-        points_dropped=(given & ~finite).sum(dtype=jnp.int32)
-        + in_range
-        - _points_in_kept_voxels(keys, kept, is_first, order, limit, overflow),
+        points_dropped=(given & ~finite).sum(dtype=jnp.int32) + in_range - in_kept.sum(dtype=jnp.int32),
     )
-
-
-def _points_in_kept_voxels(
-    keys: Array, kept: Array, is_first: Array, order: Array, limit: Array, overflow: str
-) -> Int[Array, ""]:
-    """Number of points whose voxel was kept; with "stop", of those before the limit."""
-    slots = jnp.arange(keys.shape[0], dtype=jnp.int32)
-    start_of_run = lax.cummax(jnp.where(is_first, slots, 0))
-    in_kept = kept[start_of_run] & (keys != NO_SITE)
-    if overflow == "stop":
-        in_kept &= order < limit
-    return in_kept.sum(dtype=jnp.int32)

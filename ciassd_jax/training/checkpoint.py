@@ -14,14 +14,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import orbax.checkpoint as ocp
-from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
 
 from ciassd_jax.config import Config
 from ciassd_jax.data.loader import LoaderState
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.types import TrainState
+
+# Of what a checkpoint holds; 2 since the optimizer works on one vector of all parameters.
+FORMAT = 2
 
 
 class Checkpoint(NamedTuple):
@@ -44,14 +45,18 @@ class Checkpoints:
             raise ValueError(f"{keep} checkpoints to keep are too few; keep at least 1.")
         check_folder(folder)
         self.folder, self._config = Path(folder).absolute(), config
+        import orbax.checkpoint as ocp
+        from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
+
         best = BestN(get_metric_fn=lambda metrics: metrics["score"], n=1, keep_checkpoints_without_metrics=False)
         options = ocp.CheckpointManagerOptions(
             preservation_policy=AnyPreservationPolicy([LatestN(keep), best]),
             # What a killed run left half-written.
             cleanup_tmp_directories=True,
         )
+        handlers = {"state": ocp.StandardCheckpointHandler(), "progress": ocp.JsonCheckpointHandler()}
         self._manager = ocp.CheckpointManager(
-            self.folder, options=options, item_names=("state", "progress"), item_handlers=_handlers()
+            self.folder, options=options, item_names=("state", "progress"), item_handlers=handlers
         )
 
     @property
@@ -64,7 +69,14 @@ class Checkpoints:
 
         Raises InputError where this one, or the one before, cannot be written.
         """
-        progress = {"config": json.loads(self._config.to_json()), "loader": loader._asdict(), "score": score}
+        import orbax.checkpoint as ocp
+
+        progress = {
+            "format": FORMAT,
+            "config": json.loads(self._config.to_json()),
+            "loader": loader._asdict(),
+            "score": score,
+        }
         items = ocp.args.Composite(state=ocp.args.StandardSave(state), progress=ocp.args.JsonSave(progress))
         metrics = None if score is None else {"score": score}
         try:
@@ -86,10 +98,13 @@ class Checkpoints:
         Newer ones that cannot be read are warned of and removed, so that their steps can be saved again. Raises
         InputError for a checkpoint of another config, and where there are some but none can be read.
         """
+        import orbax.checkpoint as ocp
+
         damaged: list[int] = []
         for step in reversed(self.steps):
             try:
                 progress = self._read(step, progress=ocp.args.JsonRestore())["progress"]
+                _check_format(progress, self.folder / str(step))
                 _check_config(progress["config"], self._config, self.folder / str(step))
                 state = self._read(step, state=ocp.args.StandardRestore(_abstract(like)))["state"]
             except InputError:
@@ -126,6 +141,8 @@ class Checkpoints:
                 raise
 
     def _read(self, step: int, **items: Any) -> Any:
+        import orbax.checkpoint as ocp
+
         return self._manager.restore(step, args=ocp.args.Composite(**items))
 
     def _remove(self, steps: list[int]) -> None:
@@ -153,13 +170,17 @@ def _reason(error: Exception) -> str:
     return next((line[:200] for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
-def _handlers() -> dict[str, Any]:
-    return {"state": ocp.StandardCheckpointHandler(), "progress": ocp.JsonCheckpointHandler()}
-
-
 def _abstract(state: TrainState) -> TrainState:
     """Shapes, types and sharding: the checkpoint is read onto these devices, whatever it was saved from."""
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding), state)
+
+
+def _check_format(progress: Any, path: Path) -> None:
+    if progress.get("format") != FORMAT:
+        raise InputError(
+            f"{path} was written by another version of the package, whose optimizer state differs; finish that run "
+            "with that version, or start a new run in another folder from its last.safetensors."
+        )
 
 
 def _check_config(saved: Any, config: Config, path: Path) -> None:

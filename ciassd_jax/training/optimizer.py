@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import optax
@@ -44,16 +45,17 @@ def _cycle(step: int | Array, schedule: ScheduleConfig, start: float, middle: fl
 def make_optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
     """Norm clipping, Adam with the scheduled momentum, decoupled weight decay of all parameters, the learning rate.
 
-    With `accumulate` the mean gradient of so many steps makes one update; the schedules count updates.
+    With `gradient_accumulation_steps` the mean gradient of that many steps makes one update; schedules count updates.
     """
     adam = optax.inject_hyperparams(optax.scale_by_adam, static_args=("b2", "eps"))
-    chain = optax.chain(
+    chain: Any = optax.chain(
         optax.clip_by_global_norm(schedule.max_gradient_norm),
         adam(b1=partial(momentum, schedule=schedule), b2=schedule.b2, eps=1e-8),
         optax.add_decayed_weights(schedule.weight_decay),
         optax.scale_by_learning_rate(partial(learning_rate, schedule=schedule)),
     )
-    if schedule.gradient_accumulation_steps == 1:
-        return chain
-    steps = optax.MultiSteps(chain, schedule.gradient_accumulation_steps)
-    return optax.GradientTransformation(steps.init, steps.update)
+    if schedule.gradient_accumulation_steps > 1:
+        chain = optax.MultiSteps(chain, schedule.gradient_accumulation_steps)
+    # On one vector of all parameters: a program per tensor would take seconds to compile.
+    flat = optax.flatten(optax.GradientTransformation(chain.init, chain.update))
+    return optax.GradientTransformation(flat.init, flat.update)

@@ -54,7 +54,8 @@ def train_step(
     if axis_name is not None:
         gradient, terms = lax.pmean((gradient, terms), axis_name)
         batch_stats = lax.pmean(batch_stats, axis_name)
-    norm = optax.tree.norm(gradient)
+    # Of one vector, as the optimizer's own clipping takes it.
+    norm = optax.tree.norm(jnp.concatenate([leaf.reshape(-1) for leaf in jax.tree.leaves(gradient)]))
     finite = jnp.isfinite(norm) & jnp.isfinite(terms.total)
     new_state = _update(state, gradient, batch_stats, finite, config.schedule)
     positives = (targets.label == 1).sum(1).astype(jnp.float32).mean()
@@ -110,9 +111,7 @@ def _update(
     state: TrainState, gradient: Any, batch_stats: Any, finite: jax.Array, schedule: ScheduleConfig
 ) -> TrainState:
     """The state after an update, or with one more skipped."""
-    # A gradient that is not finite would leave its mark in the optimiser even times zero.
-    usable = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0), gradient)
-    changes, optimizer = make_optimizer(schedule).update(usable, state.optimizer, state.params)
+    changes, optimizer = make_optimizer(schedule).update(gradient, state.optimizer, state.params)
     params = optax.apply_updates(state.params, changes)
     ema = state.ema
     if ema is not None:

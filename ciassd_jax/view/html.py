@@ -176,7 +176,8 @@ def _summary(described: Sequence[dict[str, Any]]) -> tuple[str, ...]:
         for note in one["notes"]:
             kinds.setdefault(re.sub(r"[\d,]+", "", note), []).append(f"{one['name']}: {note}")
     return tuple(
-        first + (f" Other frames with such a note: {len(others)}." if others else "") for first, *others in kinds.values()
+        first + (f" Other frames with such a note: {len(others)}." if others else "")
+        for first, *others in kinds.values()
     )
 
 

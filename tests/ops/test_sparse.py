@@ -251,7 +251,7 @@ def random_pairs(seed: int, inputs: int, outputs: int, offsets: int, live: np.nd
         number = min(inputs, len(live)) * 2 // 3
         rows, columns = rng.permutation(live)[:number], rng.permutation(inputs)[:number]
         forth[rows, k], back[columns, k] = columns, rows
-    return NeighbourTable(jnp.array(forth), jnp.array(back))
+    return NeighbourTable(jnp.array(forth), jnp.array(back), jnp.int32(outputs), jnp.int32(inputs))
 
 
 @jax.jit
