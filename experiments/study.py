@@ -17,7 +17,7 @@ from ciassd_jax.model.network import variables_of
 from ciassd_jax.training.loop import Intervals, fit
 from ciassd_jax.types import Variables
 
-Say = Callable[[str], object]
+Log = Callable[[str], object]
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Study:
     config: Config
     seeds: int = 1
     weights: Variables | None = None
-    say: Say = print
+    log: Log = print
 
     def validation(self) -> Dataset:
         """Open the frames that are scored."""
@@ -51,12 +51,12 @@ class Study:
 
     def _train(self, variant: str, config: Config, seed: int) -> Variables:
         folder = self.out / "trainings" / f"{variant}-seed{seed}"
-        self.say(f"{variant}, seed {seed}: training in {folder}.")
+        self.log(f"{variant}, seed {seed}: training in {folder}.")
         steps = config.schedule.total_steps
         intervals = Intervals(log=min(100, steps), save=min(250, steps), evaluate=0, keep=1)
-        fitted = fit(config, self._batches(config, seed), folder, intervals=intervals, progress=True, say=self.say)
+        fitted = fit(config, self._batches(config, seed), folder, intervals=intervals, progress=True, log=self.log)
         if fitted.stopped is not None:
-            self.say("Interrupted. Re-run the same command to resume.")
+            self.log("Interrupted. Re-run the same command to resume.")
             sys.exit(128 + fitted.stopped)
         return variables_of(fitted.state)
 
@@ -65,7 +65,7 @@ class Study:
         database = None
         if config.data.augmentation.gt_sampling:
             places = [database_path(folder, "train") for folder in (self.data, self.out) if folder is not None]
-            database = find_database(dataset, places, log=self.say)
+            database = find_database(dataset, places, log=self.log)
         options: dict[str, Any] = {"seed": seed, "batch_size": config.schedule.batch_size, "database": database}
         return make_batches(dataset, config, **options)
 

@@ -46,10 +46,10 @@ def mini_batches(root: Path, config: Config, **options: Any) -> Batches:
     return make_batches(dataset, config, **{"seed": 3, "batch_size": 2, "database": database} | options)
 
 
-def mini_fit(root: Path, workdir: Path, say: Callable[[str], object] = lambda text: None, **options: Any) -> Fitted:
+def mini_fit(root: Path, workdir: Path, log: Callable[[str], object] = lambda text: None, **options: Any) -> Fitted:
     """Frames, weights, order and augmentation are the same every time."""
     config = mini_config()
-    chosen = {"variables": random_variables(config), "intervals": INTERVALS, "say": say} | options
+    chosen = {"variables": random_variables(config), "intervals": INTERVALS, "log": log} | options
     batches = chosen.pop("batches", None) or mini_batches(root, config)
     return fit(config, batches, workdir, **chosen)
 

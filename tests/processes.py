@@ -42,7 +42,7 @@ def update(out: Path) -> None:
     step = distributed.shard_step(partial(train_step, config=CONFIG), mesh)
     after, metrics = step(distributed.replicate(state, mesh), distributed.shard_batch(rows, mesh))
     found = {"gradient": gradient_of(after), "params": after.params, "metrics": metrics}
-    if distributed.is_first():
+    if distributed.is_process_0():
         leaves = jax.tree_util.tree_leaves_with_path(jax.device_get(found))
         np.savez(out, **{jax.tree_util.keystr(path): leaf for path, leaf in leaves})
 

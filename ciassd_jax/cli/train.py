@@ -20,7 +20,7 @@ from ciassd_jax.data.loader import Batches, make_batches
 from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.inference.weights import check_fits, find_weights, load_weights
-from ciassd_jax.training.distributed import ParallelError, connect, is_first, on_first, shard
+from ciassd_jax.training.distributed import ParallelError, connect, is_process_0, on_process_0, shard
 from ciassd_jax.training.loop import Intervals, TrainingError, fit
 from ciassd_jax.training.validation import count_found
 from ciassd_jax.types import TrainState, Variables
@@ -99,7 +99,7 @@ class Train:
         with warnings_as_lines(folder or "simulated frames"):
             try:
                 connect(self.coordinator, self.num_processes, self.process_index)
-                return self._train(folder, tqdm.write if is_first() else lambda text: None)
+                return self._train(folder, tqdm.write if is_process_0() else lambda text: None)
             except (WorkerError, TrainingError, ParallelError) as error:
                 raise UsageError(str(error)) from error
 
@@ -120,7 +120,7 @@ class Train:
             variables=variables,
             intervals=intervals,
             progress=True,
-            say=log,
+            log=log,
         )
         step = int(fitted.state.step)
         if fitted.stopped is not None:
@@ -181,7 +181,7 @@ class Train:
         places = [database_path(place, self.split) for place in (folder, self.workdir) if place is not None]
         find = partial(find_database, dataset, places, frames_with_bar, log)
         # Process 0 may have to build it; the others then open it.
-        return on_first(find) or find()
+        return on_process_0(find) or find()
 
     def _variables(self, config: Config) -> Variables | None:
         if self.init_from is None:
@@ -191,6 +191,6 @@ class Train:
         return weights.variables
 
     def _report_overfit(self, state: TrainState, dataset: Dataset, config: Config, log: Callable[[str], object]) -> int:
-        found, targets = on_first(partial(count_found, state, dataset, config)) or (0, 0)
+        found, targets = on_process_0(partial(count_found, state, dataset, config)) or (0, 0)
         log(f"Frame {self.overfit_one}: {found} of {targets} objects are found at a 3D overlap of 0.7.")
         return 0 if found == targets else 1

@@ -1,15 +1,18 @@
-"""Checkpoints of a training: the state, where its loader is, and the config, as orbax writes them.
+"""Checkpoints of a training: the state, the position of the loader and the config, written by orbax.
 
-A checkpoint appears whole or not at all, written while training goes on. The last few stay, and the best by validation.
+A checkpoint appears whole or not at all, and is written while training continues. The most recent ones and the best by
+validation score are kept.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
 import shutil
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,14 +22,15 @@ from ciassd_jax.config import Config
 from ciassd_jax.data.loader import LoaderState
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike
 from ciassd_jax.formats.writing import check_folder
+from ciassd_jax.training.distributed import on_process_0
 from ciassd_jax.types import TrainState
 
-# Of what a checkpoint holds; 2 since the optimizer works on one vector of all parameters.
+# Version of a checkpoint's content; 2 since the optimizer works on one vector of all parameters.
 FORMAT = 2
 
 
 class Checkpoint(NamedTuple):
-    """What a training goes on from, and its validation score where there was one."""
+    """The state and the loader position to resume from, and the validation score if there was one."""
 
     state: TrainState
     loader: LoaderState
@@ -34,15 +38,15 @@ class Checkpoint(NamedTuple):
 
 
 class Checkpoints:
-    """The checkpoints in a folder, each named by its step; use it in `with`, or close it, to finish what is written.
+    """The checkpoints of a folder, one subfolder per step; use it in `with`, or call `close`, to finish writing.
 
-    Of all that were saved the last `keep` stay, and the one with the best score. Raises InputError, one sentence with
-    the remedy, for a folder that cannot be written.
+    Keeps the last `keep` checkpoints and the one with the best score. Raises InputError for a folder that cannot be
+    written.
     """
 
     def __init__(self, folder: Pathlike, config: Config, *, keep: int = 3) -> None:
         if keep < 1:
-            raise ValueError(f"{keep} checkpoints to keep are too few; keep at least 1.")
+            raise ValueError(f"keep is {keep}; it must be at least 1.")
         check_folder(folder)
         self.folder, self._config = Path(folder).absolute(), config
         import orbax.checkpoint as ocp
@@ -51,7 +55,7 @@ class Checkpoints:
         best = BestN(get_metric_fn=lambda metrics: metrics["score"], n=1, keep_checkpoints_without_metrics=False)
         options = ocp.CheckpointManagerOptions(
             preservation_policy=AnyPreservationPolicy([LatestN(keep), best]),
-            # What a killed run left half-written.
+            # Removes what a killed run left half-written.
             cleanup_tmp_directories=True,
         )
         handlers = {"state": ocp.StandardCheckpointHandler(), "progress": ocp.JsonCheckpointHandler()}
@@ -61,16 +65,18 @@ class Checkpoints:
 
     @property
     def steps(self) -> list[int]:
-        """Steps of the checkpoints that are there, in ascending order."""
+        """Steps of the available checkpoints, in ascending order."""
         return sorted(self._manager.all_steps())
 
     def save(self, state: TrainState, loader: LoaderState, *, score: float | None = None) -> None:
-        """Begin to write a checkpoint; it is complete after `wait`, at the latest.
+        """Start writing a checkpoint; `wait` returns when it is complete.
 
-        Raises InputError where this one, or the one before, cannot be written.
+        Raises InputError if this checkpoint or the previous one cannot be written.
         """
         import orbax.checkpoint as ocp
 
+        self.wait()
+        on_process_0(partial(self._check_space, state))
         progress = {
             "format": FORMAT,
             "config": json.loads(self._config.to_json()),
@@ -82,21 +88,22 @@ class Checkpoints:
         try:
             self._manager.save(int(state.step), args=items, metrics=metrics, force=True)
         except Exception as error:
-            raise self._refused(error) from error
+            raise self._not_written(error) from error
 
     def wait(self) -> None:
-        """Return when everything is on the disk; raises InputError where it cannot be written."""
+        """Block until every checkpoint is on the disk; raises InputError if one cannot be written."""
         try:
             self._manager.wait_until_finished()
             self._manager.check_for_errors()
         except Exception as error:
-            raise self._refused(error) from error
+            raise self._not_written(error) from error
 
     def restore(self, like: TrainState) -> Checkpoint | None:
-        """The newest checkpoint that can be read, with the shapes and the sharding of `like`; None without any.
+        """Return the newest readable checkpoint, with the shapes and sharding of `like`; None if there is none.
 
-        Newer ones that cannot be read are warned of and removed, so that their steps can be saved again. Raises
-        InputError for a checkpoint of another config, and where there are some but none can be read.
+        Newer checkpoints that cannot be read are removed with a FormatWarning, so that their steps can be saved again.
+        Raises InputError for a checkpoint of another config or an earlier format, and if none can be read; then
+        nothing is removed.
         """
         import orbax.checkpoint as ocp
 
@@ -109,7 +116,7 @@ class Checkpoints:
                 state = self._read(step, state=ocp.args.StandardRestore(_abstract(like)))["state"]
             except InputError:
                 raise
-            # Whatever is wrong with the files: orbax and its storage have many words for it.
+            # Orbax and its storage raise errors of many types for damaged files.
             except Exception:
                 damaged.append(step)
                 continue
@@ -117,13 +124,13 @@ class Checkpoints:
             return Checkpoint(state, LoaderState(**progress["loader"]), progress["score"])
         if damaged:
             raise InputError(
-                f"None of the checkpoints in {self.folder} can be read; start anew in another folder, from "
-                "last.safetensors beside it if you like."
+                f"None of the checkpoints in {self.folder} can be read; start a new run in another folder, for example "
+                "from the weights in last.safetensors."
             )
         return None
 
     def close(self) -> None:
-        """Finish what is being written; raises InputError where it cannot be."""
+        """Finish writing; raises InputError if a checkpoint cannot be written."""
         try:
             self.wait()
         finally:
@@ -136,7 +143,7 @@ class Checkpoints:
         try:
             self.close()
         except InputError:
-            # The first error says more.
+            # An error that is already being raised comes first.
             if kind is None:
                 raise
 
@@ -147,21 +154,26 @@ class Checkpoints:
 
     def _remove(self, steps: list[int]) -> None:
         for step in steps:
-            text = f"{self.folder / str(step)} is damaged; it was removed, and training goes on from the one before."
+            text = f"{self.folder / str(step)} is damaged and was removed; resuming from the checkpoint before it."
             warnings.warn(text, FormatWarning, stacklevel=3)
             shutil.rmtree(self.folder / str(step))
         if steps:
             self._manager.reload()
 
-    def _refused(self, error: Exception) -> InputError:
+    def _check_space(self, state: TrainState) -> None:
+        """Raise InputError on a disk that is too full; a write that fails midway makes orbax print pages of traces."""
+        if shutil.disk_usage(self.folder).free < sum(leaf.nbytes for leaf in jax.tree.leaves(state)):
+            raise self._not_written(OSError(errno.ENOSPC, ""))
+
+    def _not_written(self, error: Exception) -> InputError:
         return InputError(
-            f"A checkpoint cannot be written to {self.folder} ({_reason(error)}); free some space or mend its "
-            "permissions, then run again: the earlier ones are intact."
+            f"A checkpoint cannot be written to {self.folder} ({_reason(error)}); free some space or check its "
+            "permissions, then run again: the earlier checkpoints are intact."
         )
 
 
 def _reason(error: Exception) -> str:
-    """The operating system's words where it is known that they are its; else the beginning of the error's."""
+    """Return the operating system's message if the error has its code, otherwise the error's first line."""
     code = error.errno if isinstance(error, OSError) else None
     if found := re.search(r"os_error_code='(\d+)'", str(error)):
         code = int(found[1])
@@ -171,7 +183,7 @@ def _reason(error: Exception) -> str:
 
 
 def _abstract(state: TrainState) -> TrainState:
-    """Shapes, types and sharding: the checkpoint is read onto these devices, whatever it was saved from."""
+    """Return shapes, types and sharding; orbax restores onto these devices, whichever the state was saved from."""
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding), state)
 
 
@@ -184,16 +196,20 @@ def _check_format(progress: Any, path: Path) -> None:
 
 
 def _check_config(saved: Any, config: Config, path: Path) -> None:
-    mine = json.loads(config.to_json())
-    if saved != mine:
+    """Raise InputError unless the saved config, with defaults for the fields that it lacks, equals `config`."""
+    try:
+        parsed = Config.from_json(json.dumps(saved))
+    except ValueError as error:
+        raise InputError(f"{path} has a config that this version cannot read: {error}") from error
+    if parsed != config:
+        difference = first_difference(json.loads(parsed.to_json()), json.loads(config.to_json()))
         raise InputError(
-            f"{path} is of another config: {first_difference(saved, mine)}; use the config of the first run, or "
-            "another folder."
+            f"{path} has another config: {difference}; use the config that the run was started with, or another folder."
         )
 
 
 def first_difference(saved: Any, wanted: Any, where: str = "config") -> str:
-    """The first field in which two parsed JSON values differ, and both its values."""
+    """Return the first field in which two parsed JSON values differ, with both values."""
     if isinstance(saved, dict) and isinstance(wanted, dict):
         for name in [*saved, *(name for name in wanted if name not in saved)]:
             if name not in saved or name not in wanted:

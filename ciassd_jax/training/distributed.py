@@ -1,7 +1,7 @@
-"""Training on several devices of several processes: their mesh, what lies where, and how the processes agree.
+"""Data parallelism over the devices of one or several processes: the mesh, the placement of arrays, agreement.
 
-The scenes of a batch are spread over one axis of all devices, and the state is on each of them. With one process on one
-device nothing here changes anything.
+The scenes of a batch are sharded over one axis of all devices, and the state is replicated. On a single device nothing
+here changes the program.
 """
 
 from __future__ import annotations
@@ -22,32 +22,33 @@ from ciassd_jax.types import Scene
 Value = TypeVar("Value")
 Tree = TypeVar("Tree")
 AXIS = "scenes"
-# What a process says to the others that cannot go on; the number of a signal is larger.
+# The code of a process that failed; smaller than the number of any signal that is handled.
 FAILED = 1
 
 
 class ParallelError(RuntimeError):
-    """Processes and devices do not fit together, or one of them cannot go on; the message is one sentence."""
+    """Processes and devices do not fit together, or another process failed; the message is one sentence."""
 
 
 def connect(coordinator: str | None, num_processes: int | None, process_index: int | None) -> None:
-    """Join the other processes, before anything else that asks JAX for a device.
+    """Connect to the other processes; call this before anything that initialises JAX's devices.
 
-    Without arguments the environment decides: a step of SLURM or a TPU pod of several processes is joined, anything
-    else runs alone. The coordinator "auto" takes all three numbers from whatever cluster JAX finds. Raises
-    ParallelError for arguments that do not fit together and where the others cannot be reached.
+    Without arguments, a SLURM step or TPU pod of several processes is joined and any other process runs alone. With
+    the coordinator "auto", JAX finds all three in its cluster environment. Raises ParallelError if only some of the
+    arguments are given, if the index is out of range, and if the other processes cannot be reached.
     """
     given = (coordinator, num_processes, process_index)
     automatic = given == ("auto", None, None) or (given == (None, None, None) and _is_cluster(os.environ))
     if given == (None, None, None) and not automatic:
         return
     if not automatic and (coordinator is None or num_processes is None or process_index is None):
-        raise ParallelError("A coordinator, the number of processes and this one's index go together; give all three.")
+        raise ParallelError("Coordinator, number of processes and process index go together; give all three.")
     if not automatic and not 0 <= process_index < num_processes:  # type: ignore[operator]
         raise ParallelError(
-            f"There is no process {process_index} of {num_processes}; number them from 0 to their number less one."
+            f"There is no process {process_index} of {num_processes}; number the processes from 0 to "
+            f"{num_processes - 1}."  # type: ignore[operator]
         )
-    # It would take SIGTERM for itself.
+    # JAX's preemption service would handle SIGTERM itself.
     jax.config.update("jax_enable_preemption_service", False)
     where = (None, None, None) if automatic else given
     try:
@@ -61,25 +62,25 @@ def connect(coordinator: str | None, num_processes: int | None, process_index: i
 
 
 def _is_cluster(environment: Mapping[str, str]) -> bool:
-    """Whether SLURM's srun, or a TPU pod, started several processes and this is one of them."""
+    """Whether this is one of several processes of a SLURM step or a TPU pod."""
     tasks, workers = environment.get("SLURM_STEP_NUM_TASKS", "1"), environment.get("TPU_WORKER_HOSTNAMES", "")
     return (tasks != "1" and "SLURM_PROCID" in environment) or "," in workers
 
 
-def is_first() -> bool:
-    """Whether this is the process that writes and speaks for all."""
+def is_process_0() -> bool:
+    """Whether this is process 0, which alone writes and logs."""
     return jax.process_index() == 0
 
 
 def shard() -> tuple[int, int]:
-    """This process's index and their number, as `make_batches` takes them."""
+    """Return (process index, number of processes), the `shard` of `make_batches`."""
     return jax.process_index(), jax.process_count()
 
 
 def data_mesh(batch_size: int) -> Mesh:
-    """All devices of all processes in one axis; of a single process as many as divide the batch.
+    """Return a mesh with one axis over all devices; in a single process, over as many as divide the batch size.
 
-    Raises ParallelError for a batch that several processes cannot share evenly.
+    Raises ParallelError if the devices of several processes do not divide the batch size.
     """
     devices = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
     count = len(devices)
@@ -94,27 +95,27 @@ def data_mesh(batch_size: int) -> Mesh:
 
 
 def describe(mesh: Mesh) -> str:
-    """The devices in words, and why some are left out."""
-    platform, there, processes = mesh.devices.flat[0].platform, len(jax.devices()), jax.process_count()
-    if there == 1:
+    """Describe the devices of a mesh, and why some are unused."""
+    platform, available, processes = mesh.devices.flat[0].platform, len(jax.devices()), jax.process_count()
+    if available == 1:
         return platform
-    if mesh.size < there:
-        return f"{mesh.size} of {there} {platform} devices (no more divide the batch)"
-    return f"{there} {platform} devices" + (f" of {processes} processes" if processes > 1 else "")
+    if mesh.size < available:
+        return f"{mesh.size} of {available} {platform} devices (no larger number divides the batch size)"
+    return f"{available} {platform} devices" + (f" of {processes} processes" if processes > 1 else "")
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Everything on every device."""
+    """Return the sharding that places a whole array on every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def replicate(tree: Tree, mesh: Mesh) -> Tree:
-    """A copy of a tree, the same in all processes, on every device; its leaves can be donated, as none share memory."""
+    """Copy a tree, equal in all processes, to every device; its leaves share no memory, so that they can be donated."""
     return jax.device_put(jax.tree.map(np.array, tree), replicated(mesh), may_alias=False)
 
 
 def shard_batch(batch: Scene, mesh: Mesh) -> Scene:
-    """The whole batch, spread over the devices, from the rows that each process has."""
+    """Return the global batch, sharded over the devices, from the rows of each process."""
     rows = NamedSharding(mesh, PartitionSpec(AXIS))
     if jax.process_count() == 1:
         return jax.device_put(batch, rows)
@@ -122,10 +123,10 @@ def shard_batch(batch: Scene, mesh: Mesh) -> Scene:
 
 
 def shard_step(step: Callable[..., Any], mesh: Mesh) -> Callable[[Any, Scene], Any]:
-    """A step (state, batch, axis_name=None) on a state and a batch that are spread so, jitted; the state is given up.
+    """Return `step(state, batch, axis_name=None)` jitted for a replicated state, which is donated, and a sharded batch.
 
-    Each device runs the step on its own scenes and pools what must be pooled over the axis. Left to the compiler, a
-    sharded batch would have the features of all scenes gathered on all devices in every layer.
+    Each device runs the step on its own scenes and pools over the axis. Under automatic partitioning, every layer would
+    gather the features of all scenes on all devices.
     """
     if mesh.size > 1:
         everywhere, rows = PartitionSpec(), PartitionSpec(AXIS)
@@ -134,39 +135,39 @@ def shard_step(step: Callable[..., Any], mesh: Mesh) -> Callable[[Any, Scene], A
             mesh=mesh,
             in_specs=(everywhere, rows),
             out_specs=everywhere,
-            # That the outputs are equal is the step's promise, as under pmap.
+            # JAX cannot infer that the outputs are equal on all devices; the step pools them itself.
             check_vma=False,
         )
     return jax.jit(step, donate_argnums=0)
 
 
-def agreed(code: int) -> int:
-    """The largest of what the processes say, once each has said something; all must call it equally often."""
+def max_over_processes(code: int) -> int:
+    """Return the largest code of all processes; blocks until every process has called it."""
     if jax.process_count() == 1:
         return code
     return int(multihost_utils.process_allgather(np.int32(code)).max())
 
 
-def on_first(work: Callable[[], Value]) -> Value | None:
-    """What `work` returns on the first process; the others wait for it and get None.
+def on_process_0(work: Callable[[], Value]) -> Value | None:
+    """Return `work()` on process 0; the others wait for it and return None.
 
-    An error of it is raised there, and ParallelError on the others.
+    If `work` raises, process 0 raises the same error and the others raise ParallelError.
     """
-    if not is_first():
-        if agreed(0):
-            raise ParallelError("The first process cannot go on, and says why; the same command goes on once it can.")
+    if not is_process_0():
+        if max_over_processes(0):
+            raise ParallelError("Process 0 failed and reports why; resume with the same command.")
         return None
     try:
         value = work()
     except BaseException:
-        agreed(FAILED)
+        max_over_processes(FAILED)
         raise
-    agreed(0)
+    max_over_processes(0)
     return value
 
 
-def from_first(number: float | None) -> float | None:
-    """The first process's number on all of them, in single precision where there are several."""
+def broadcast_from_process_0(number: float | None) -> float | None:
+    """Return process 0's number on all processes, rounded to float32 if there are several."""
     if jax.process_count() == 1:
         return number
     known: Any = multihost_utils.broadcast_one_to_all(np.float32(math.nan if number is None else number))

@@ -1,4 +1,4 @@
-"""The record of a training: `metrics.jsonl`, one JSON object a line, and TensorBoard events where there is a writer."""
+"""Training metrics over time: `metrics.jsonl`, one JSON object per line, and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ import numpy as np
 from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.writing import replacing
 
-# Metrics that are a state rather than an amount of each step.
+# Metrics of which a summary takes the last value instead of the mean.
 _STATES = ("learning_rate", "momentum", "skipped")
 
 
 class MetricsLog:
-    """Lines of numbers by step; close it at the end.
+    """The metrics file of a folder, opened to resume after `step`; close it at the end.
 
-    Lines of steps after `step`, where training goes on, were written by a run that was cut off; they are removed.
-    `lines` are those of the folder so far. Raises InputError where nothing can be written.
+    Lines of later steps come from an interrupted run and are removed. `lines` holds all lines of the file. TensorBoard
+    events are written if tensorboardX is installed. Raises InputError if the file cannot be written.
     """
 
-    def __init__(self, workdir: Path, step: int, say: Callable[[str], object] = print) -> None:
+    def __init__(self, workdir: Path, step: int, log: Callable[[str], object] = print) -> None:
         self.path = workdir / "metrics.jsonl"
         self.lines = [line for line in _read(self.path) if line["step"] <= step]
         with replacing(self.path) as temporary:
             temporary.write_text("".join(map(_format, self.lines)), encoding="utf-8")
         self._stream = open(self.path, "a", encoding="utf-8")  # noqa: SIM115
-        self._events = _open_events(workdir / "tb", step, say)
+        self._events = _open_events(workdir / "tb", step, log)
 
     def write(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Add a line, on the disk at once; what is not finite becomes null."""
+        """Append a line and flush it; non-finite numbers become null."""
         line = {"step": step, **{name: value if math.isfinite(value) else None for name, value in numbers.items()}}
         with self._refusing():
             self._stream.write(_format(line))
@@ -46,6 +46,7 @@ class MetricsLog:
                 self._events.add_scalar(name, value, step)
 
     def close(self) -> None:
+        """Close the files."""
         with self._refusing():
             self._stream.close()
             if self._events is not None:
@@ -63,24 +64,32 @@ class MetricsLog:
 
 
 def summarise(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
-    """The metrics of several steps as one: states as they are at the end, sums of what was left out, and means."""
+    """Return the metrics of several steps as one: the sum of overflow counts, the last of states, else the mean."""
     numbers = {}
     for name in rows[0]:
         values = [row[name] for row in rows]
         if name in _STATES:
             numbers[name] = float(values[-1])
         else:
-            numbers[name] = float(np.sum(values) if is_left_out(name) else np.mean(values))
+            numbers[name] = float(np.sum(values) if _is_overflow_count(name) else np.mean(values))
     return numbers
 
 
-def is_left_out(name: str) -> bool:
-    """Whether a metric counts what did not fit."""
+def describe_metrics(step: int, total: int, numbers: Mapping[str, float]) -> str:
+    """Return one line on the summarised metrics of a training of `total` steps, with the overflow counts above 0."""
+    dropped = [f"{name} {value:.0f}" for name, value in numbers.items() if _is_overflow_count(name) and value]
+    return (
+        f"step {step}/{total}  epoch {numbers['epoch']:.2f}  loss {numbers['loss']:.4f}"
+        f"  {numbers['seconds']:.2f} s/step" + (f"  ({', '.join(dropped)})" if dropped else "")
+    )
+
+
+def _is_overflow_count(name: str) -> bool:
     return name.endswith(("_cut", "_dropped"))
 
 
 def _read(path: Path) -> Iterator[dict[str, Any]]:
-    """The complete lines of a record; a killed run may leave the last one cut."""
+    """Yield the complete lines of a metrics file; a killed run may truncate the last one."""
     if not path.is_file():
         return
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -96,10 +105,10 @@ def _format(line: Mapping[str, Any]) -> str:
     return json.dumps(line, allow_nan=False) + "\n"
 
 
-def _open_events(folder: Path, step: int, say: Callable[[str], object]) -> Any:
+def _open_events(folder: Path, step: int, log: Callable[[str], object]) -> Any:
     try:
         writer = importlib.import_module("tensorboardX").SummaryWriter
     except ImportError:
-        say("No TensorBoard events are written, as tensorboardX is not installed; metrics.jsonl has the same numbers.")
+        log("tensorboardX is not installed, so no TensorBoard events are written; metrics.jsonl has the same numbers.")
         return None
     return writer(str(folder), purge_step=step + 1)

@@ -1,4 +1,4 @@
-"""Signals that ask a program to end, noted so that it can save first."""
+"""Signals that ask a program to end, deferred so that it can save first."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def signals_noted() -> Iterator[list[int]]:
-    """The first SIGTERM or Ctrl-C is noted in the list; a second one acts as ever.
+def deferred_signals() -> Iterator[list[int]]:
+    """Yield a list to which the first SIGTERM or SIGINT is appended; a second signal gets the previous handler.
 
-    One that is ignored, as Ctrl-C is in the background of a shell, stays so. Other threads than the main one get none.
+    An ignored signal, such as SIGINT in a background job, stays ignored. Outside the main thread nothing is handled.
     """
-    noted: list[int] = []
+    received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield noted
+        yield received
         return
     before = {number: signal.getsignal(number) or signal.SIG_DFL for number in (signal.SIGTERM, signal.SIGINT)}
     before = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
@@ -25,13 +25,13 @@ def signals_noted() -> Iterator[list[int]]:
         for number, handler in before.items():
             signal.signal(number, handler)
 
-    def note(number: int, _: object) -> None:
-        noted.append(number)
+    def defer(number: int, _: object) -> None:
+        received.append(number)
         restore()
 
     for number in before:
-        signal.signal(number, note)
+        signal.signal(number, defer)
     try:
-        yield noted
+        yield received
     finally:
         restore()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from ciassd_jax.config import Config
@@ -16,7 +15,6 @@ from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.writing import write_text
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.scoring import detect_dataset, score_frames, write_frames
-from ciassd_jax.model.network import variables_of
 from ciassd_jax.ops.iou import iou_3d
 from ciassd_jax.types import Boxes, Variables
 
@@ -26,15 +24,10 @@ class Validation:
 
     def __init__(self, dataset: Dataset, config: Config) -> None:
         self._dataset, self._config = dataset, config
-        self._detector: Detector | None = None
 
     def score(self, state_or_variables: Variables, folder: Path) -> dict[str, float]:
         """AP of the weights, and in `folder` its whole result.json and table.txt, and data/NAME.txt of every frame."""
-        variables = jax.device_get(variables_of(state_or_variables))
-        if self._detector is None:
-            self._detector = Detector(variables, self._config)
-        detector = self._detector.with_variables(variables)
-        frames = detect_dataset(detector, self._dataset)
+        frames = detect_dataset(Detector(state_or_variables, self._config), self._dataset)
         evaluation = score_frames(frames)
         write_frames(frames, folder / "data")
         write_text(folder / "result.json", format_json(evaluation))
@@ -75,11 +68,11 @@ def count_found(
     Targets are the labelled objects of a class whose centre lies in the grid, of any difficulty, or of KITTI's up to
     `hardest` (0 easy, 1 moderate, 2 hard).
     """
-    detector, found, targets = Detector(jax.device_get(variables_of(variables)), config), 0, 0
+    detector, found, targets = Detector(variables, config), 0, 0
     low, high = np.array(config.grid.minimum), np.array(config.grid.maximum)
     for index in range(len(dataset)):
         frame = dataset.read(index)
-        result = detector.detect(frame.points, frustum=frustum_of(frame.camera))
+        result = detector(frame.points, frustum=frustum_of(frame.camera))
         boxes = Boxes.from_array(result.boxes.astype(np.float64))
         label = target_labels(frame, config)
         center = frame.boxes.center

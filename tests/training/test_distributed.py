@@ -71,7 +71,7 @@ def test_two_processes_stop_together_and_one_goes_on(tmp_path: Path) -> None:
 
     ((code, said, errors),) = run_together(("train", 0, *options))
     assert code == 0, errors
-    assert "Going on from step 4 in " in said
+    assert "Resuming from step 4 in " in said
     lines = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == [1, 2, 3, 4, 5, 6]
     assert [line["step"] for line in lines if "score" in line] == [3, 6]
@@ -81,7 +81,7 @@ def test_a_single_process_takes_as_many_devices_as_divide_the_batch() -> None:
     assert len(jax.devices()) == 2
     for batch_size, devices, words in (
         (4, 2, "2 cpu devices"),
-        (3, 1, "1 of 2 cpu devices (no more divide the batch)"),
+        (3, 1, "1 of 2 cpu devices (no larger number divides the batch size)"),
     ):
         mesh = data_mesh(batch_size)
         assert (mesh.size, describe(mesh)) == (devices, words)

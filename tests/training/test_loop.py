@@ -32,7 +32,7 @@ from ciassd_jax.training import loop
 from ciassd_jax.training.checkpoint import Checkpoints
 from ciassd_jax.training.loop import Fitted, Intervals, TrainingError, fit
 from ciassd_jax.training.metrics import MetricsLog
-from ciassd_jax.training.signals import signals_noted
+from ciassd_jax.training.signals import deferred_signals
 from ciassd_jax.types import TrainState
 
 
@@ -140,7 +140,7 @@ def test_a_stopped_run_goes_on_with_the_same_bits(
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == handlers
     said: list[str] = []
     resumed = mini_fit(root, tmp_path, said.append)
-    assert said[0].startswith("Going on from step 3 in ")
+    assert said[0].startswith("Resuming from step 3 in ")
     assert_same_bits(resumed.state, whole[0].state)
     assert lines(tmp_path) == lines(whole[1])
     # There is nothing left to do.
@@ -164,7 +164,7 @@ def test_a_killed_run_goes_on_with_the_same_bits(
     assert process.returncode == -signal.SIGKILL, errors.decode()
     said: list[str] = []
     resumed = mini_fit(root, tmp_path, said.append)
-    assert said[0].startswith("Going on from step "), said
+    assert said[0].startswith("Resuming from step "), said
     assert_same_bits(resumed.state, whole[0].state)
     assert lines(tmp_path) == lines(whole[1])
 
@@ -207,7 +207,7 @@ def test_a_dead_worker_loses_no_step(
 
 
 def test_losses_that_stay_not_finite_end_it(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "_HOPELESS", 4)
+    monkeypatch.setattr(loop, "_MAX_SKIPPED", 4)
     broken = jax.tree.map(lambda leaf: leaf * np.float32(np.nan), random_variables(mini_config()))
     with pytest.raises(TrainingError, match="last 4 updates were not finite"):
         mini_fit(root, tmp_path, variables=broken, intervals=Intervals(log=4))
@@ -216,7 +216,7 @@ def test_losses_that_stay_not_finite_end_it(root: Path, tmp_path: Path, monkeypa
 
 def test_another_stream_is_refused(whole: tuple[Fitted, Path, list[str]], root: Path) -> None:
     batches = mini_batches(root, mini_config(), seed=4)
-    with pytest.raises(InputError, match=r"is of another training: .*seed 3 instead of 4"):
+    with pytest.raises(InputError, match=r"belongs to another training: .*seed 3 instead of 4"):
         fit(mini_config(), batches, whole[1])
     assert len(lines(whole[1])) == STEPS
 
@@ -271,7 +271,7 @@ def test_intervals_that_are_none_are_refused() -> None:
 
 
 def test_a_second_signal_acts_as_ever() -> None:
-    with signals_noted() as noted:
+    with deferred_signals() as noted:
         signal.raise_signal(signal.SIGINT)
         assert noted == [signal.SIGINT]
         with pytest.raises(KeyboardInterrupt):
@@ -280,7 +280,7 @@ def test_a_second_signal_acts_as_ever() -> None:
 
 def test_an_ignored_signal_stays_ignored() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with signals_noted() as noted:
+    with deferred_signals() as noted:
         signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     assert noted == []
