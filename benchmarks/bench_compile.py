@@ -94,7 +94,7 @@ def parts(config: Config, batch: int) -> Iterator[Program]:
         yield f"{name} + gradient", gradient(module), (tree["params"], x, {"batch_stats": tree["batch_stats"]}, fixed)
     yield "head", head.apply, (of("head"), features)
     raw = jax.eval_shape(partial(predict_raw, config=config), variables, batched.cloud)
-    yield "postprocess", postprocess_of(postprocess, config), (raw, batched.cloud)
+    yield "postprocess", partial(postprocess, config=config), (raw,)
     anchors, labels = make_anchors(config)
     assign = partial(assign_targets, anchors=anchors, anchor_labels=labels, classes=config.classes)
     yield "targets", jax.vmap(assign), (batched.truth,)
@@ -107,10 +107,6 @@ def parts(config: Config, batch: int) -> Iterator[Program]:
     optimizer = make_optimizer(config.schedule)
     moments = jax.eval_shape(optimizer.init, variables["params"])
     yield "optimizer update", optimizer.update, (variables["params"], moments, variables["params"])
-
-
-def postprocess_of(function: Callable[..., Any], config: Config) -> Callable[..., Any]:
-    return lambda raw, cloud: function(raw, cloud, config)
 
 
 def measure(function: Callable[..., Any], arguments: tuple[Any, ...]) -> dict[str, float]:

@@ -48,19 +48,19 @@ def our_detector(shared: Path, preset: str | None) -> ciassd_jax.Detector:
 
 
 def peer_detector(shared: Path):
-    """Return the same network in torch + spconv on two threads."""
+    """Return the detection of the same network in torch + spconv on two threads."""
     import torch
     from peer_torch import load_peer
 
     torch.set_num_threads(2)
-    return load_peer(shared / "golden/weights.safetensors")
+    return load_peer(shared / "golden/weights.safetensors").detect
 
 
 def measure_alone(kind: str, arguments: argparse.Namespace) -> None:
     """Run one detector over the frames and print the peak memory of this process in MB."""
     detector = our_detector(arguments.shared, arguments.preset) if kind == "ours" else peer_detector(arguments.shared)
     for points, _ in load_frames(arguments.shared, arguments.frames):
-        detector.detect(points)
+        detector(points)
     # Not getrusage, whose maximum is inherited from the parent process.
     status = Path("/proc/self/status").read_text()
     print(int(status.split("VmHWM:")[1].split()[0]) / 1e3)
@@ -98,12 +98,12 @@ def main() -> None:
         detectors["peer"] = peer_detector(arguments.shared)
     seconds: dict[str, list[float]] = {name: [] for name in detectors}
     for detector in detectors.values():
-        detector.detect(frames[0][0])
+        detector(frames[0][0])
     for _ in range(arguments.repeats):
         for points, planes in frames:
             for name, detector in detectors.items():
                 options = {"frustum": planes} if name == "ours" else {}
-                seconds[name].append(timed(detector.detect, points, **options))
+                seconds[name].append(timed(detector, points, **options))
     for name, values in seconds.items():
         print(
             f"{name}: {1e3 * statistics.median(values):.0f} ms per frame (median; {1e3 * min(values):.0f} to "

@@ -1,13 +1,23 @@
-"""Records that cross the boundary between two stages.
+"""Records that pass from one stage to the next.
 
-Every record is a NamedTuple of arrays. Shapes are given for one scene; a batch is the same record with a
-leading axis B on every leaf. Padding comes last and is inert.
+Every record is a NamedTuple of arrays. Shapes are given for one scene; a batch is the same record with a leading axis
+B on every leaf. Real entries come first, padding after them.
 
-Letters: B scenes, P points, V voxel or site slots, A anchors, G truth boxes, K candidates, D detections,
-H W cells of the bird's-eye-view (BEV) map, C channels, S strided stages of the backbone, N classes, O objects
-that may be pasted and Q their points.
+Letters of shapes:
+    B     scenes of a batch
+    P     points
+    V     voxel or site slots
+    A     anchors
+    G     truth boxes
+    D     detections
+    H, W  cells of the bird's-eye-view (BEV) map along y and x
+    C     channels
+    S     strided stages of the backbone
+    N     classes
+    K     candidates; offsets of a sparse kernel
+    O, Q  objects for ground-truth sampling, their points
 
-Frame: LiDAR, x forward, y left, z up, metres. Yaw is counter-clockwise from +x, in radians.
+Coordinates are in the LiDAR frame: x forward, y left, z up, in metres. Yaw is counter-clockwise from +x, in radians.
 """
 
 from __future__ import annotations
@@ -20,19 +30,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt32
 
 Array = jax.Array | np.ndarray
-# Flax variables: {"params": ..., "batch_stats": ...}, or a train state that has both.
+# {"params": ..., "batch_stats": ...} as in Flax, or a train state.
 Variables = Any
 
 
 class PointCloud(NamedTuple):
-    """Points as x, y, z in metres and intensity in [0, 1]; the first `count` rows are real."""
+    """Points as (x, y, z, intensity), intensity in [0, 1]; the first `count` rows are real."""
 
     points: Float[Array, "*b P 4"]
     count: Int[Array, "*b"]  # type: ignore[assignment]
 
 
 class Boxes(NamedTuple):
-    """Boxes by geometric centre (x, y, z), size (length, width, height) and yaw."""
+    """Boxes as geometric centre (x, y, z), size (length, width, height) and yaw."""
 
     center: Float[Array, "*b 3"]
     size: Float[Array, "*b 3"]
@@ -40,11 +50,11 @@ class Boxes(NamedTuple):
 
     @classmethod
     def from_array(cls, array: Float[Array, "*b 7"]) -> Boxes:
-        """Read (x, y, z, length, width, height, yaw) from the last axis."""
+        """Return boxes from (x, y, z, length, width, height, yaw) on the last axis."""
         return cls(array[..., :3], array[..., 3:6], array[..., 6])
 
     def to_array(self) -> Float[Array, "*b 7"]:
-        """Write (x, y, z, length, width, height, yaw) on a last axis."""
+        """Return (x, y, z, length, width, height, yaw) on a new last axis; NumPy if all leaves are."""
         numpy = all(isinstance(leaf, np.ndarray) for leaf in self)
         parts = [self.center, self.size, self.yaw[..., None]]
         return np.concatenate(parts, -1) if numpy else jnp.concatenate(parts, -1)
@@ -53,8 +63,8 @@ class Boxes(NamedTuple):
 class GroundTruth(NamedTuple):
     """Labelled boxes of a scene; the first `count` rows are real, the others zero with label -1.
 
-    `label` is the class that a box is a target of (a similar class counts as it), -1 for an object of no class: an
-    obstacle that nothing may be put onto, and no target.
+    `label` is the class that a box is a target of; a similar class counts as it. Label -1 marks an obstacle: an object
+    that is no target but keeps sampled objects away.
     """
 
     boxes: Boxes
@@ -63,10 +73,10 @@ class GroundTruth(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """A labelled frame, padded: what the loader gives and `train_step` takes.
+    """A labelled frame, padded: the loader's output and the input of `train_step`.
 
-    `frame` is the frame's place in its data set, -1 for a scene that only fills a batch. `points_cut`, `boxes_cut` and
-    `objects_cut` (of those drawn from the ground-truth database) count what was over capacity.
+    `frame` is the index of the frame in its data set, -1 for a scene that only fills a batch. `points_cut`, `boxes_cut`
+    and `objects_cut` (objects drawn from the ground-truth database) count what was over capacity.
     """
 
     cloud: PointCloud
@@ -80,9 +90,9 @@ class Scene(NamedTuple):
 class SampledObjects(NamedTuple):
     """Objects drawn from the ground-truth database for one scene, in the LiDAR frame and the order of the draw.
 
-    Slot k holds an object where `valid`: for every class two rounds of as many slots as objects may be wanted. Point
-    q belongs to the object in slot `owner[q]`; padding points have the number of slots there. `wanted` is the
-    number of objects of each class that the scene still lacks, `cut` counts objects whose points did not fit.
+    Slots where `valid` hold an object. Each class has two rounds of slots, each of `gt_sampling_up_to`. Point q belongs
+    to the object in slot `owner[q]`; for padding points `owner` is the number of slots. `wanted` is the number of
+    objects of each class that the scene still lacks, `cut` counts objects whose points did not fit.
     """
 
     boxes: Boxes
@@ -97,9 +107,9 @@ class SampledObjects(NamedTuple):
 class SparseVoxels(NamedTuple):
     """Occupied voxels in ascending order of their linear key (y, x, z with z fastest).
 
-    `coordinates` are (z, y, x). `first_point` is the index of the point that touched the voxel first.
-    `dropped` counts voxels over capacity, `points_dropped` the points that went with them and those that are
-    not finite.
+    `features` are the mean of a voxel's first points, `coordinates` are (z, y, x), and `first_point` is the index of
+    the first point in the voxel. `dropped` counts voxels over capacity, `points_given` all points of the cloud,
+    `points_dropped` those that are not finite and those whose voxel was dropped.
     """
 
     features: Float[Array, "*b V C"]
@@ -108,15 +118,16 @@ class SparseVoxels(NamedTuple):
     first_point: Int[Array, "*b V"]
     count: Int[Array, "*b"]  # type: ignore[assignment]
     dropped: Int[Array, "*b"]
+    points_given: Int[Array, "*b"]
     points_in_range: Int[Array, "*b"]
     points_dropped: Int[Array, "*b"]
 
 
 class Sites(NamedTuple):
-    """Active sites of one grid by ascending linear key; padding has the largest int32 and comes last.
+    """Active sites of one grid by ascending linear key; the key of padding is the largest int32.
 
-    `columns` finds them (`ops/sites.py`): for every BEV column (y, x) a bit for each active z in words of 32, then the
-    slot of the lowest. The dense backend has none.
+    `columns` is the index that finds a site's slot (`ops/sites.py`). For every BEV column (y, x) it has one bit per
+    active z, in words of 32, then the slot of the lowest site. The dense backend has none.
     """
 
     keys: Int[Array, "*b V"]
@@ -125,11 +136,11 @@ class Sites(NamedTuple):
 
 
 class NeighbourTable(NamedTuple):
-    """Which input site each kernel offset reads, and its transpose for the backward pass.
+    """The input site that each kernel offset reads, and the transposed table for the backward pass.
 
-    `inputs[o, k]` is the input site under offset k of output site o, `outputs[i, k]` the output site that
-    reads input site i through offset k. Where there is none, the number of input (output) slots stands. The first
-    `num_outputs` and `num_inputs` rows of a scene are real.
+    `inputs[o, k]` is the input site under offset k of output site o, `outputs[i, k]` the output site that reads input
+    site i through offset k. A missing site has the number of input (output) slots as its index. The first `num_outputs`
+    and `num_inputs` rows of a scene are real.
     """
 
     inputs: Int[Array, "*b V K"]
@@ -139,10 +150,10 @@ class NeighbourTable(NamedTuple):
 
 
 class Predictions(NamedTuple):
-    """What the network says of every anchor, before any decoding.
+    """The network's output for every anchor, not decoded.
 
-    `box` holds the residuals in the paper's order (x, y, z, w, l, h, r), `class_logit` the logit of the
-    anchor's own class, `direction` two logits, `iou` the raw IoU output in about [-1, 1], None without that branch.
+    `box` holds the residuals in the paper's order (x, y, z, w, l, h, r), `class_logit` the logit of the anchor's own
+    class, `direction` two logits, `iou` the raw IoU output in about [-1, 1]; it is None without that branch.
     """
 
     box: Float[Array, "*b A 7"]
@@ -152,11 +163,11 @@ class Predictions(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """What the network should say of every anchor.
+    """The training targets of every anchor.
 
-    `label` is 1 for a positive anchor, 0 for a negative one, -1 for one that does not count. `truth` is the index of
-    the truth box that a positive anchor is matched to, `box` the residuals to it in the paper's order and `direction`
-    its direction class; the others have -1, zeros and 0 there.
+    `label` is 1 for a positive anchor, 0 for a negative one and -1 for an ignored one. For a positive anchor `truth` is
+    the index of its truth box, `box` the residuals to that box in the paper's order and `direction` its direction
+    class; for other anchors these are -1, zeros and 0.
     """
 
     label: Int[Array, "*b A"]
@@ -166,7 +177,7 @@ class Targets(NamedTuple):
 
 
 class LossTerms(NamedTuple):
-    """The parts of the loss before their weights, and `total`, the weighted sum."""
+    """The unweighted terms of the loss, and `total`, their weighted sum."""
 
     classification: Float[Array, "*b"]
     box: Float[Array, "*b"]
@@ -178,8 +189,8 @@ class LossTerms(NamedTuple):
 class TrainState(NamedTuple):
     """Everything that a training step changes.
 
-    `ema` is the running mean of the parameters, None where the config asks for none; evaluation and prediction use
-    it when it is there. `skipped` counts updates that were not finite and therefore left out.
+    `ema` is the running mean of the parameters, None if `schedule.ema_decay` is 0; evaluation and prediction use it in
+    place of `params`. `skipped` counts updates that were skipped because they were not finite.
     """
 
     step: Int[Array, ""]
@@ -191,10 +202,10 @@ class TrainState(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """How much of a scene was used, and how much every fixed capacity had to drop.
+    """How much of a scene was used, and how much did not fit into the fixed capacities.
 
-    `points_dropped` are those that are not finite and those in range whose voxel was over capacity; points beyond
-    the fixed number per voxel are not among them: the method leaves them out by design.
+    `points_dropped` counts points that are not finite and points in range whose voxel was over capacity. Points beyond
+    `grid.max_points_per_voxel` are not counted: the method ignores them by design.
     """
 
     points_given: Int[Array, "*b"]
@@ -211,8 +222,8 @@ class Counts(NamedTuple):
 class Candidates(NamedTuple):
     """Decoded anchors above the score threshold, best confidence first.
 
-    `score` is the rectified confidence f = c * q**beta, `iou` the predicted IoU q, `anchor_distance` the
-    BEV distance in metres between the box centre and its anchor's centre, `direction` the class (0 or 1).
+    `score` is the rectified confidence f = c * q**beta (paper equation 6), `iou` the predicted IoU q, `anchor_distance`
+    the BEV distance in metres between the centres of box and anchor, `direction` the direction class, 0 or 1.
     """
 
     boxes: Boxes
@@ -225,7 +236,7 @@ class Candidates(NamedTuple):
 
 
 class Detections(NamedTuple):
-    """Final boxes in the order of their selection; the first `count` rows are real, the others zero."""
+    """Final boxes in the order of selection; the first `count` rows are real, the others zero."""
 
     boxes: Boxes
     score: Float[Array, "*b D"]

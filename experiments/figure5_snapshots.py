@@ -30,7 +30,7 @@ def run(study: Study) -> Report:
     rows, figures = [], {}
     for index in sorted(set(np.linspace(0, len(dataset) - 1, FRAMES).astype(int).tolist())):
         frame = dataset.read(index)
-        result, truth = detector.detect(frame.points, frustum=frustum_of(frame.camera)), target_boxes(frame, config)
+        result, truth = detector(frame.points, frustum=frustum_of(frame.camera)), target_boxes(frame, config)
         found = Boxes.from_array(result.boxes.astype(np.float64))
         overlap = nearest_overlap(truth, found) if len(result) and len(truth.yaw) else np.zeros(len(truth.yaw))
         matched = int((overlap >= MATCHED).sum())

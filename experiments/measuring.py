@@ -28,7 +28,7 @@ from ciassd_jax.model.network import RawPredictions, predict_raw
 from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.ops.iou import iou_3d
 from ciassd_jax.training.validation import precision_of
-from ciassd_jax.types import Candidates, PointCloud, Predictions, Variables
+from ciassd_jax.types import Candidates, Predictions, Variables
 
 _predict_raw = jax.jit(predict_raw)
 _postprocess = jax.jit(postprocess)
@@ -50,11 +50,10 @@ class DecodedBoxes(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """A frame with its labels, its padded cloud and the network's raw predictions."""
+    """A frame with its labels and the network's raw predictions."""
 
     frame: Frame
     truth: LabelledObjects
-    cloud: PointCloud
     raw: RawPredictions
 
 
@@ -88,8 +87,7 @@ def _predictions(variables: Variables, config: Config, dataset: Dataset) -> Iter
         return tqdm(names, unit="frame", leave=False, disable=None)
 
     for frame, truth in labelled_frames(dataset, track):
-        cloud = pad_to_bucket(frame.points)
-        yield Predicted(frame, truth, cloud, _predict_raw(variables, cloud, config))
+        yield Predicted(frame, truth, _predict_raw(variables, pad_to_bucket(frame.points), config))
 
 
 def _score(one: Predicted, config: Config, settings: Mapping[str, DetectionConfig]) -> dict[str, Scored]:
@@ -97,7 +95,7 @@ def _score(one: Predicted, config: Config, settings: Mapping[str, DetectionConfi
     planes = ANYWHERE if one.frame.camera is None else view_planes(one.frame.camera)
     scored = {}
     for name, setting in settings.items():
-        batch = _postprocess(one.raw, one.cloud, replace(config, detection=setting), frustum=planes[None])
+        batch = _postprocess(one.raw, replace(config, detection=setting), frustum=planes[None])
         scored[name] = score_frame(one.frame, one.truth, frame_result(batch, config, 0.0))
     return scored
 

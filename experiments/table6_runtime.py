@@ -70,7 +70,7 @@ def parts_of(variables: Variables, config: Config) -> Callable[[Frame], dict[str
         voxelized = time.perf_counter()
         raw = jax.block_until_ready(network(variables, voxels))
         predicted = time.perf_counter()
-        jax.device_get(finish(raw, cloud, frustum=planes))
+        jax.device_get(finish(raw, frustum=planes))
         finished = time.perf_counter()
         jax.device_get(whole(variables, pad_to_bucket(frame.points), frustum=planes))
         ended = time.perf_counter()

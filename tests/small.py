@@ -7,14 +7,9 @@ from typing import Any
 
 import jax
 import numpy as np
-import pytest
 
-from ciassd_jax import Config, Detector, init_variables, tiny
-from ciassd_jax.inference.detector import bucket_of
+from ciassd_jax import Config, init_variables, tiny
 from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
-
-_PROGRAMS: dict[tuple[Config, int], Any] = {}
-_compile = Detector.compile
 
 
 def small_config() -> Config:
@@ -62,18 +57,6 @@ R0_rect: 1 0 0 0 1 0 0 0 1
 Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
 """
 IMAGE_SIZE = (640, 480)
-
-
-def share_programs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compile each program once for all detectors of this process."""
-
-    def compile_once(self: Detector, num_points: int) -> Any:
-        key = self.config, bucket_of(num_points)
-        if key not in _PROGRAMS:
-            _PROGRAMS[key] = _compile(self, num_points)
-        return _PROGRAMS[key]
-
-    monkeypatch.setattr(Detector, "compile", compile_once)
 
 
 def random_scene(config: Config, seed: int) -> Scene:

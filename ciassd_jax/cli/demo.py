@@ -47,7 +47,7 @@ class Demo:
             detector.compile(max(len(frame.points) for frame in frames))
             written, shown = [], []
             for frame in frames:
-                result = detector.detect(frame.points)
+                result = detector(frame.points)
                 objects = "" if self.file else f", {len(frame.truth)} labelled objects"
                 print(f"\n{frame.name}: {len(frame.points)} points{objects}\n{result}", flush=True)
                 shown.append(result.show_in(frame))

@@ -58,7 +58,7 @@ class Predict:
 
     def _cloud(self, detector: Detector, cloud: CloudFile) -> tuple[FrameResult, list[Path]]:
         with warnings_as_lines(cloud.cloud):
-            result = detector.detect(read_points(cloud.cloud), frustum=frustum_of(cloud.camera))
+            result = detector(read_points(cloud.cloud), frustum=frustum_of(cloud.camera))
             return result, write_result(result, cloud.cloud.stem, self.out, cloud.camera)
 
     def _folder(self, detector: Detector, clouds: Sequence[CloudFile]) -> None:

@@ -105,7 +105,7 @@ class View:
 def _detect(detector: Detector, frame: ViewFrame) -> ViewFrame:
     """The frame with its detections; with a camera only those that it sees."""
     with warnings_as_lines(frame.name):
-        return detector.detect(frame.points, frustum=frustum_of(frame.camera)).show_in(frame)
+        return detector(frame.points, frustum=frustum_of(frame.camera)).show_in(frame)
 
 
 def _add_saved(frames: Sequence[ViewFrame], folder: Path) -> list[ViewFrame]:

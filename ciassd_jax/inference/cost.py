@@ -1,4 +1,4 @@
-"""What a config costs: parameters, arithmetic, and the memory of the compiled program."""
+"""The cost of a config: parameters, floating-point operations, and memory of the compiled program."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from math import prod
 from typing import Any
 
 import jax
-import numpy as np
 
 from ciassd_jax.config import Config
-from ciassd_jax.inference.detector import Detector
+from ciassd_jax.inference.detector import bucket_of
+from ciassd_jax.inference.predict import compile_predict
 from ciassd_jax.model.network import init_variables
 
 PARTS = ("backbone", "neck", "head")
 
 
 def count_parameters(config: Config) -> dict[str, int]:
-    """Trainable parameters of each part and in all."""
+    """Return the number of trainable parameters of each part and in total."""
     params = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))["params"]
     counts = {part: sum(prod(leaf.shape) for leaf in jax.tree.leaves(params[part])) for part in PARTS}
     return counts | {"total": sum(counts.values())}
 
 
 def count_flops(config: Config) -> dict[str, int]:
-    """Floating-point operations of one scene's convolutions, by part and in all.
+    """Return the floating-point operations of one scene's convolutions, by part and in total.
 
-    Two for each multiply-add. The backbone is counted at full capacity: a real scene costs what it fills.
+    A multiply-add counts as two. The backbone is counted at full capacity; a scene with fewer sites costs less.
     """
     params = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))["params"]
     cells = prod(config.bev_shape)
@@ -39,23 +39,21 @@ def count_flops(config: Config) -> dict[str, int]:
 
 
 def _positions(part: str, layer: str, config: Config, cells: int) -> int:
-    """How often a layer's kernel is applied."""
+    """Return the number of positions where a layer's kernel is applied."""
     if part == "backbone":
         capacities = config.backbone.capacities(config.grid.max_voxels)
         return capacities[-1] if layer == "out" else capacities[int(layer[len("stage")])]
-    # The semantic branch works at half resolution; a transposed convolution applies its taps once per input.
+    # The semantic branch has half the resolution; a transposed convolution applies its kernel once per input cell.
     half = layer.startswith(("semantic_0", "semantic_1", "semantic_2", "semantic_lateral", "upsample"))
     return cells // 4 if half else cells
 
 
 def compiled_memory(config: Config, num_points: int) -> dict[str, Any]:
-    """Bytes of the compiled `predict` for clouds of up to so many points, and the platform that it was built for."""
-    variables = jax.tree.map(
-        lambda leaf: np.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(partial(init_variables, config=config), jax.random.key(0)),
-    )
-    memory: Any = Detector(variables, config).compile(num_points).memory_analysis()
-    # Not every backend reports its memory.
+    """Return the platform and the memory, in bytes, of `predict` compiled for clouds of up to `num_points` points.
+
+    A number is None if the backend does not report it.
+    """
+    memory: Any = compile_predict(config.for_inference(), bucket_of(num_points)).memory_analysis()
     return {
         "platform": jax.default_backend(),
         "arguments": getattr(memory, "argument_size_in_bytes", None),

@@ -1,4 +1,4 @@
-"""From raw predictions to boxes: decode, rectify the confidence, suppress, orient (paper section 3.4, SPEC 10)."""
+"""From raw predictions to boxes: decode, rectify the confidence, suppress, orient (paper section 3.4)."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ from ciassd_jax.model.network import RawPredictions
 from ciassd_jax.ops import boxes as box_ops
 from ciassd_jax.ops import camera, nms
 from ciassd_jax.ops.rows import take_rows
-from ciassd_jax.types import Array, Boxes, Candidates, Counts, Detections, PointCloud, Predictions
+from ciassd_jax.types import Array, Boxes, Candidates, Counts, Detections, Predictions
 
-RANGE_AXES = tuple[float, float]
+Vector = tuple[float, float, float]
 
 
 def rectify(
     probability: Float[Array, "*n"], iou: Float[Array, "*n"], config: DetectionConfig
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Confidence f = c * q**beta and the predicted IoU q = (raw + 1) / 2 (paper equation 6)."""
+    """Return the confidence f = c * q**beta and the predicted IoU q = (raw + 1) / 2 (paper equation 6)."""
     quality = (iou + 1) / 2
     if config.clamp_iou:
         quality = quality.clip(0, 1)
-    # An unclamped q may be slightly negative; beta is even in the paper, so its sign never counts.
+    # Without clamping q may be slightly negative. beta is 4 in the paper, so the sign does not matter.
     return probability * jnp.abs(quality) ** config.iou_exponent, quality
 
 
 def select_candidates(
     predictions: Predictions, anchors: Boxes, labels: Int[Array, " A"], config: DetectionConfig
 ) -> tuple[Candidates, Int[Array, ""]]:
-    """Decode the anchors of one scene whose class probability reaches the threshold.
+    """Decode the anchors of one scene whose class probability reaches `config.score_threshold`.
 
-    Returns the `max_candidates` of best rectified confidence, best first, and how many more there were.
+    Return the `config.max_candidates` of highest rectified confidence, best first, and the number that was dropped.
+    Non-finite candidates are dropped and counted.
     """
     probability = jax.nn.sigmoid(predictions.class_logit)
-    # Without an IoU branch every box counts as perfect.
+    # Without an IoU branch the predicted IoU q is 1.
     raw_iou = jnp.ones_like(probability) if predictions.iou is None else predictions.iou
     score, quality = rectify(probability, raw_iou, config)
     passes = probability >= config.score_threshold
     capacity = min(config.max_candidates, passes.shape[0])
-    # What is no number could not be ranked: it is counted with the dropped.
     usable = passes & jnp.isfinite(score) & jnp.isfinite(predictions.box).all(-1)
     best, index = lax.top_k(jnp.where(usable, score, -jnp.inf), capacity)
     valid = jnp.isfinite(best)
-    said = (predictions.box, predictions.direction, quality, anchors, labels)
-    residuals, direction, quality, chosen, label = take_rows(said, index)
+    columns = (predictions.box, predictions.direction, quality, anchors, labels)
+    residuals, direction, quality, chosen, label = take_rows(columns, index)
     boxes = box_ops.decode(residuals, chosen)
     offset = boxes.center[:, :2] - chosen.center[:, :2]
     candidates = Candidates(
@@ -65,7 +65,7 @@ def select_candidates(
 def suppress(
     candidates: Candidates, config: DetectionConfig, classes: tuple[ClassConfig, ...]
 ) -> tuple[Candidates, nms.Clusters]:
-    """The configured NMS; also returns the candidates in the order that it selected from."""
+    """Run the NMS of `config.nms`; return the candidates in its order of selection, and their clusters."""
     if config.nms == "rotated":
         return candidates, nms.rotated_nms(candidates, overlap=config.nms_iou_threshold)
     run = nms.released_di_nms
@@ -85,20 +85,19 @@ def finish(
     candidates: Candidates,
     clusters: nms.Clusters,
     *,
-    x_limits: RANGE_AXES,
-    y_limits: RANGE_AXES,
-    z_limits: RANGE_AXES,
+    minimum: Vector,
+    maximum: Vector,
     frustum: Float[Array, "6 4"] | None,
 ) -> tuple[Boxes, Float[Array, " K"], Int[Array, " K"], Int[Array, ""]]:
-    """Direction, frustum and range of the selected boxes; boxes, scores, labels and how many are real.
+    """Orient the selected boxes, and drop those whose centre is outside the frustum or the closed range.
 
-    The real ones come first, in the order of selection; the others are zero. Yaw is not wrapped.
+    Return boxes, scores, labels and count. The real rows come first, in the order of selection; the others are zero.
+    Yaw is not wrapped.
     """
     keep = clusters.selected
     if frustum is not None:
         keep &= camera.inside_planes(clusters.boxes.center, frustum)
     boxes = box_ops.apply_direction(clusters.boxes, candidates.direction)
-    minimum, maximum = zip(x_limits, y_limits, z_limits, strict=True)
     keep &= box_ops.inside_range(boxes, minimum, maximum)
     order = jnp.argsort(~keep, stable=True)
     keep, *selected = take_rows((keep, boxes, clusters.score, candidates.label), order)
@@ -108,43 +107,38 @@ def finish(
     return boxes, score, label, keep.sum(dtype=jnp.int32)
 
 
-def postprocess(
-    raw: RawPredictions, cloud: PointCloud, config: Config, *, frustum: Float[Array, "B 6 4"] | None = None
-) -> Detections:
-    """Decode, rectify, suppress and filter each scene of the batch on its own."""
-    anchors, labels = make_anchors(config)
-    low, high = config.grid.minimum, config.grid.maximum
+def postprocess(raw: RawPredictions, config: Config, *, frustum: Float[Array, "B 6 4"] | None = None) -> Detections:
+    """Decode, rectify, suppress and filter the predictions of each scene; yaw is wrapped to [-pi, pi).
 
-    def one_scene(predictions: Predictions, planes: Array | None) -> tuple:
-        candidates, dropped = select_candidates(predictions, anchors, labels, config.detection)
-        kept = candidates.valid.sum(dtype=jnp.int32)
+    `frustum` (`ops.camera.frustum_planes`) drops boxes whose centre is outside the camera's view.
+    """
+    anchors, labels = make_anchors(config)
+    (low, high), grid = config.detection.z_limits, config.grid
+    minimum, maximum = (*grid.minimum[:2], low), (*grid.maximum[:2], high)
+
+    def one_scene(scene: RawPredictions, planes: Array | None) -> Detections:
+        candidates, dropped = select_candidates(scene.predictions, anchors, labels, config.detection)
+        counts = _count(scene, candidates, dropped)
         candidates, clusters = suppress(candidates, config.detection, config.classes)
-        result = finish(
-            candidates,
-            clusters,
-            x_limits=(low[0], high[0]),
-            y_limits=(low[1], high[1]),
-            z_limits=config.detection.z_limits,
-            frustum=planes,
-        )
-        return *result, kept, dropped
+        found = finish(candidates, clusters, minimum=minimum, maximum=maximum, frustum=planes)
+        boxes, score, label, count = found
+        return Detections(boxes._replace(yaw=box_ops.wrap_angle(boxes.yaw)), score, label, count, counts)
 
     with jax.named_scope("postprocess"):
         planes = None if frustum is None else jnp.asarray(frustum, jnp.float32)
-        in_axes = (0, None if planes is None else 0)
-        boxes, score, label, count, kept, dropped = jax.vmap(one_scene, in_axes)(raw.predictions, planes)
-    # Results leave here: only now is the yaw folded to [-pi, pi).
-    boxes = boxes._replace(yaw=box_ops.wrap_angle(boxes.yaw))
-    voxels = raw.voxels
-    counts = Counts(
-        points_given=jnp.asarray(cloud.count),
+        return jax.vmap(one_scene, in_axes=(0, None if planes is None else 0))(raw, planes)
+
+
+def _count(scene: RawPredictions, candidates: Candidates, dropped: Int[Array, ""]) -> Counts:
+    voxels = scene.voxels
+    return Counts(
+        points_given=voxels.points_given,
         points_in_range=voxels.points_in_range,
         points_dropped=voxels.points_dropped,
         voxels_kept=voxels.count,
         voxels_dropped=voxels.dropped,
-        sites_kept=raw.sites_kept,
-        sites_dropped=raw.sites_dropped,
-        candidates_kept=kept,
+        sites_kept=scene.sites_kept,
+        sites_dropped=scene.sites_dropped,
+        candidates_kept=candidates.valid.sum(dtype=jnp.int32),
         candidates_dropped=dropped,
     )
-    return Detections(boxes, score, label, count, counts)

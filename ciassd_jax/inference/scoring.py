@@ -66,7 +66,7 @@ def detect_dataset(
         with warnings.catch_warnings():
             # The counts of the results say the same.
             warnings.filterwarnings("ignore", "Dropped ", DroppedWarning)
-            result = detector.detect(frame.points, frustum=frustum_of(frame.camera))
+            result = detector(frame.points, frustum=frustum_of(frame.camera))
         scored.append(score_frame(frame, truth, result))
     if dropped := describe_dropped(scored):
         warnings.warn(dropped, DroppedWarning, stacklevel=2)

@@ -49,6 +49,7 @@ def init_variables(key: Array, config: Config) -> Any:
         first_point=slot,
         count=none,
         dropped=none,
+        points_given=none,
         points_in_range=none,
         points_dropped=none,
     )

@@ -109,6 +109,7 @@ def voxelize(
         first_point=jnp.where(real, order[start], capacity),
         count=count,
         dropped=touched - count,
+        points_given=jnp.asarray(cloud.count),
         points_in_range=in_range,
         points_dropped=(given & ~finite).sum(dtype=jnp.int32) + in_range - in_kept.sum(dtype=jnp.int32),
     )

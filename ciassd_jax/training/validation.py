@@ -1,4 +1,4 @@
-"""Scores while training goes on: average precision on a data set, and whether one frame was learnt by heart."""
+"""Scores of weights in training: average precision on a data set, and how many objects are found."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from ciassd_jax.types import Boxes, Variables
 
 
 class Validation:
-    """Scores ever newer weights on one data set; the programs are compiled once."""
+    """Scores successive weights on one data set, with programs that are compiled once."""
 
     def __init__(self, dataset: Dataset, config: Config) -> None:
         self._dataset, self._config = dataset, config
 
     def score(self, state_or_variables: Variables, folder: Path) -> dict[str, float]:
-        """AP of the weights, and in `folder` its whole result.json and table.txt, and data/NAME.txt of every frame."""
+        """Return `precisions` of the weights; write result.json, table.txt and data/NAME.txt per frame to `folder`."""
         frames = detect_dataset(Detector(state_or_variables, self._config), self._dataset)
         evaluation = score_frames(frames)
         write_frames(frames, folder / "data")
@@ -36,10 +36,10 @@ class Validation:
 
 
 def precisions(evaluation: Evaluation, config: Config) -> dict[str, float]:
-    """AP R40 moderate in percent, in 3D and BEV at both limits, of the first class that KITTI's rules know.
+    """Return AP R40 moderate in percent, in 3D and BEV at both IoU limits, of the first class that KITTI evaluates.
 
-    The first number is 3D's at the strict limit. Where nothing is detected the official program evaluates nothing; that
-    is 0 here.
+    The first number is 3D at the strict limit. It is 0 if nothing was detected, where KITTI's program prints nothing.
+    Empty without such a class.
     """
     name = next((name for name in config.class_names if name in LIMITS), None)
     if name is None:
@@ -63,10 +63,10 @@ def precision_of(
 def count_found(
     variables: Variables, dataset: Dataset, config: Config, limit: float = 0.7, *, hardest: int | None = None
 ) -> tuple[int, int]:
-    """How many targets in all frames are found with their class and at least so much 3D overlap, and of how many.
+    """Return (found, targets): how many targets in all frames are found, with their class and a 3D IoU >= `limit`.
 
-    Targets are the labelled objects of a class whose centre lies in the grid, of any difficulty, or of KITTI's up to
-    `hardest` (0 easy, 1 moderate, 2 hard).
+    Targets are the labelled objects of a configured class whose centre lies in the grid, with `hardest` only those of
+    KITTI's difficulties up to it (0 easy, 1 moderate, 2 hard).
     """
     detector, found, targets = Detector(variables, config), 0, 0
     low, high = np.array(config.grid.minimum), np.array(config.grid.maximum)

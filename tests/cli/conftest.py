@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from cli_files import Run
 from mini_folders import write_kitti
-from small import random_variables, share_programs, small_config
+from small import random_variables, small_config
 
 from ciassd_jax import open_dataset, save_weights
 from ciassd_jax.cli import main
@@ -15,9 +15,8 @@ from ciassd_jax.simulation import split_synthetic
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
-    """Run `ciassd` with these arguments; programs are shared between tests."""
-    share_programs(monkeypatch)
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., Run]:
+    """Run `ciassd` with these arguments."""
 
     def call(*arguments: object) -> Run:
         code = main([str(argument) for argument in arguments])

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from mini_folders import NAMES, write_custom, write_kitti, write_split
-from small import random_variables, share_programs, small_config
+from small import random_variables, small_config
 
 from ciassd_jax import save_weights
 from ciassd_jax.cli import main
@@ -91,9 +91,8 @@ def test_starts_no_device(folders: tuple[Path, Path]) -> None:
 
 
 @pytest.fixture
-def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def work(tmp_path: Path) -> Path:
     """Weights in the folder of a training, beside a KITTI folder with a split of two of its frames."""
-    share_programs(monkeypatch)
     save_weights(tmp_path / "run/last.safetensors", random_variables(small_config()), small_config())
     write_split(write_kitti(tmp_path / "kitti"), "val", *NAMES[:2])
     return tmp_path

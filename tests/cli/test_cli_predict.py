@@ -169,7 +169,7 @@ def test_other_warnings_are_left_alone(run: Any, weights: Path, tmp_path: Path, 
         warnings.warn("of another library", stacklevel=1)
 
     write_bin(tmp_path / "a.bin", small_cloud())
-    monkeypatch.setattr("ciassd_jax.inference.detector.Detector.detect", warn)
+    monkeypatch.setattr("ciassd_jax.inference.detector.Detector.__call__", warn)
     with pytest.raises(UserWarning, match="of another library"):
         run("predict", tmp_path / "a.bin", "--weights", weights, "--out", tmp_path / "out")
 
@@ -182,7 +182,7 @@ def test_threshold_and_dtype_override_the_file(run: Any, weights: Path, tmp_path
         return FrameResult(np.zeros((0, 7)), np.zeros(0), (), {}, 0.0)
 
     write_bin(tmp_path / "a.bin", small_cloud())
-    monkeypatch.setattr("ciassd_jax.inference.detector.Detector.detect", detect)
+    monkeypatch.setattr("ciassd_jax.inference.detector.Detector.__call__", detect)
     common = ("predict", tmp_path / "a.bin", "--weights", weights, "--out", tmp_path / "out")
     assert run(*common, "--dtype", "bfloat16", "--score-threshold", "0.7").code == 0
     assert run(*common).code == 0
@@ -305,7 +305,7 @@ def test_a_mistake_of_ours_keeps_its_traceback(run: Any, weights: Path, tmp_path
         raise ValueError("shapes do not match")
 
     write_bin(tmp_path / "a.bin", small_cloud())
-    monkeypatch.setattr("ciassd_jax.inference.detector.Detector.detect", broken)
+    monkeypatch.setattr("ciassd_jax.inference.detector.Detector.__call__", broken)
     with pytest.raises(ValueError, match="shapes do not match"):
         run("predict", tmp_path / "a.bin", "--weights", weights, "--out", tmp_path / "out")
 

@@ -15,7 +15,7 @@ import pytest
 from cli_files import Run
 from mini_folders import write_split
 from mini_training import STEPS, mini_config, share_training_programs, write_data
-from small import random_variables, share_programs
+from small import random_variables
 
 from ciassd_jax import create_train_state, load_weights, make_batches, open_dataset, save_weights
 from ciassd_jax.cli import main
@@ -41,7 +41,6 @@ def run(root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Monk
         return Run(code, *capsys.readouterr())
 
     share_training_programs(monkeypatch)
-    share_programs(monkeypatch)
     monkeypatch.setitem(PRESETS, "tiny", mini_config)
     return call
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from mini_folders import NAMES, OBJECTS, object_boxes, write_custom, write_kitti
-from small import IMAGE_SIZE, random_variables, share_programs, small_cloud, small_config
+from small import IMAGE_SIZE, random_variables, small_cloud, small_config
 
 from ciassd_jax import save_weights
 from ciassd_jax.cli import main
@@ -35,7 +35,6 @@ class Run(NamedTuple):
 @pytest.fixture
 def view(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
     """Run `ciassd view` in an empty folder; also the frames of the page where it wrote one."""
-    share_programs(monkeypatch)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
 

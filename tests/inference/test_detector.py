@@ -3,6 +3,7 @@
 import re
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small import random_variables, share_programs, small_cloud, small_config
+from small import random_variables, small_cloud, small_config
 
 from ciassd_jax import Boxes, Detections, Detector, PointCloud, save_weights
+from ciassd_jax.config import LossConfig, ScheduleConfig
 from ciassd_jax.formats.errors import DroppedWarning, InputError
 from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.types import Counts
 
 
 @pytest.fixture
-def detector(monkeypatch: pytest.MonkeyPatch) -> Detector:
-    share_programs(monkeypatch)
+def detector() -> Detector:
     return Detector(random_variables(small_config()), small_config())
 
 
@@ -128,7 +129,7 @@ def test_another_shape_is_refused(detector: Detector, shape: tuple[int, ...]) ->
 def test_every_bucket_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
     traced = []
 
-    def nothing(variables: Any, cloud: PointCloud, config: Any, *, frustum: jax.Array) -> Detections:
+    def nothing(variables: Any, cloud: PointCloud, *, config: Any, frustum: jax.Array) -> Detections:
         traced.append(cloud.points.shape)
         none = jnp.zeros_like(cloud.count)
         boxes = Boxes(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)), jnp.zeros((1, 2)))
@@ -138,12 +139,21 @@ def test_every_bucket_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
         total = cloud.points.sum() + frustum.sum() + sum(leaf.sum() for leaf in jax.tree.leaves(variables))
         return Detections(boxes, jnp.zeros((1, 2)) * total, jnp.zeros((1, 2), jnp.int32), none, counts)
 
-    monkeypatch.setattr("ciassd_jax.inference.detector.predict", nothing)
-    detector = Detector(random_variables(small_config()), small_config())
+    # A config of its own, as programs are kept.
+    config = replace(small_config(), dtype="bfloat16")
+    monkeypatch.setattr("ciassd_jax.inference.predict.predict", nothing)
+    detector = Detector(random_variables(config), config)
     monkeypatch.setattr("ciassd_jax.inference.detector.SMALLEST_BUCKET", 64)
     for count in (1, 64, 63, 65, 256, 10, 257):
         assert detector(np.zeros((count, 4), np.float32)).counts["points"]["given"] == count
     assert traced == [(1, 64, 4), (1, 256, 4), (1, 1024, 4)]
+
+
+def test_configs_that_differ_in_training_alone_share_a_program(detector: Detector) -> None:
+    config = replace(small_config(), schedule=ScheduleConfig(learning_rate=1.0), loss=LossConfig(box_weight=1.0))
+    other = Detector(random_variables(config, 1), config)
+    assert other.config == config != detector.config
+    assert other.compile(10) is detector.compile(20)
 
 
 def test_repr_is_short_and_readable() -> None:

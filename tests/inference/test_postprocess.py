@@ -1,7 +1,7 @@
 """Post-processing against the released code's numbers, and what the paper's preset does otherwise."""
 
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,22 +37,21 @@ class Stages(NamedTuple):
     count: jax.Array
 
 
-@partial(jax.jit, static_argnames=("config",))
+@jax.jit
 def detect(
     predictions: Predictions, anchors: Boxes, labels: jax.Array, config: Config, frustum: jax.Array | None = None
 ) -> Stages:
-    """The stages of `prediction.postprocess` for one scene."""
+    """The stages of `postprocess` for one scene."""
     numbers = jnp.arange(labels.shape[0], dtype=jnp.int32)
     numbered, _ = select_candidates(predictions, anchors, numbers, config.detection)
     candidates, dropped = select_candidates(predictions, anchors, labels, config.detection)
     ordered, clusters = suppress(candidates, config.detection, config.classes)
-    limits = [(config.grid.minimum[axis], config.grid.maximum[axis]) for axis in (0, 1)]
+    low, high = config.detection.z_limits
     result = finish(
         ordered,
         clusters,
-        x_limits=limits[0],
-        y_limits=limits[1],
-        z_limits=config.detection.z_limits,
+        minimum=(*config.grid.minimum[:2], low),
+        maximum=(*config.grid.maximum[:2], high),
         frustum=frustum,
     )
     return Stages(candidates, numbered.label, dropped, ordered, clusters, *result)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mini_folders import NAMES, OBJECTS, object_boxes, write_custom, write_kitti
-from small import random_variables, share_programs, small_config
+from small import random_variables, small_config
 
 from ciassd_jax import Detector, load_weights
 from ciassd_jax.data.folders import open_dataset
@@ -35,7 +35,7 @@ class Oracle(Detector):
     def __init__(self, detect: Detect) -> None:
         self._find = detect
 
-    def detect(self, points: Any, *, frustum: np.ndarray | None = None) -> FrameResult:
+    def __call__(self, points: Any, *, frustum: np.ndarray | None = None) -> FrameResult:
         boxes, labels = self._find(points)
         counts = {
             "points": {"given": len(points), "in_range": len(points), "dropped": 0},
@@ -231,8 +231,7 @@ def test_other_warnings_are_left_alone(tmp_path: Path) -> None:
     assert len(caught) == 2
 
 
-def test_drops_are_summed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    share_programs(monkeypatch)
+def test_drops_are_summed(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
     crowd = np.random.default_rng(0).uniform([0, -6.4, -3, 0], [12.8, 6.4, 1, 1], (9000, 4)).astype(np.float32)
     for name, points in zip(NAMES[1:], (crowd, np.float32([[50, 0, 0, 0.5], [60, 1, 0, 0.5]])), strict=True):
@@ -269,8 +268,7 @@ def test_real_frames_evaluate_like_their_files(shared: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.reference
-def test_golden_weights_on_real_frames(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    share_programs(monkeypatch)
+def test_golden_weights_on_real_frames(shared: Path, tmp_path: Path) -> None:
     weights = load_weights(shared / "golden/weights.pth")
     everything = open_dataset(shared / "kitti", "val")
     dataset = replace(everything, names=("000010", *everything.names[:2]))

@@ -185,12 +185,12 @@ def test_the_other_iou_head(shared: Path, golden: dict, frame: str) -> None:
 @pytest.mark.parametrize("frame", FRAMES)
 def test_final_boxes(shared: Path, golden: dict, frame: str) -> None:
     weights, _ = network(shared)
-    cloud, voxels, (predictions, kept, dropped), _ = result(shared, frame)
+    _, voxels, (predictions, kept, dropped), _ = result(shared, frame)
     height, width = golden[f"{frame}_image_shape"]
     projection = golden[f"{frame}_P2"][:3] @ golden[f"{frame}_R0_rect"] @ golden[f"{frame}_Tr_velo_to_cam"]
     planes = frustum_planes(projection, width=int(width), height=int(height))[None].astype(np.float32)
     raw = RawPredictions(predictions, voxels, kept, dropped)
-    detections = jax.jit(postprocess, static_argnames="config")(raw, cloud, weights.config, frustum=planes)
+    detections = jax.jit(postprocess, static_argnames="config")(raw, weights.config, frustum=planes)
     expected = golden[f"{frame}_final_boxes"]
     count = int(detections.count[0])
     assert count == len(expected)

@@ -30,7 +30,7 @@ finish = jax.jit(postprocess, static_argnames="config")
 def run_one(variables, cloud):
     """The two halves of `predict` on one scene of ROWS points: all tests of this module share one compile."""
     raw = predict_raw(variables, cloud, TINY)
-    return raw, postprocess(raw, cloud, TINY)
+    return raw, postprocess(raw, TINY)
 
 
 def dense(config: Config) -> Config:
@@ -118,7 +118,7 @@ def test_detections_are_those_of_the_definition(variables, seed, nms):
     )
     cloud = batch_of(random_points(seed, 300))
     raw, _ = run_one(variables, cloud)
-    found = finish(raw, cloud, config)
+    found = finish(raw, config)
     expected = postprocess_by_loop(jax.tree.map(lambda leaf: leaf[0], raw.predictions), config)
     assert expected.margin > 1e-5
     count = int(found.count[0])

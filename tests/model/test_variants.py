@@ -62,7 +62,7 @@ def test_without_the_iou_branch_the_confidence_is_the_class_probability() -> Non
     @jax.jit
     def both(variables, cloud):
         raw = predict_raw(variables, cloud, config)
-        return raw.predictions, postprocess(raw, cloud, config)
+        return raw.predictions, postprocess(raw, config)
 
     predictions, found = both(bare, cloud)
     assert predictions.iou is None
