@@ -218,7 +218,7 @@ class _Run:
         self.log(describe_metrics(step, self.config.schedule.total_steps, numbers))
         if self.skipped_in_a_row >= _MAX_SKIPPED:
             raise TrainingError(
-                f"The last {self.skipped_in_a_row} updates were not finite; lower schedule.learning_rate or use float32, "
+                f"The last {self.skipped_in_a_row} updates were not finite; lower the learning rate or use float32, "
                 "and start a new run in another folder."
             )
 

@@ -1,4 +1,4 @@
-"""The optimiser and its schedules."""
+"""The optimiser, Adam with decoupled weight decay, and its schedules."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from ciassd_jax.types import Array
 
 
 def learning_rate(step: int | Array, schedule: ScheduleConfig) -> Array:
-    """Learning rate of an update, from 0: one cycle with two half cosines, or one half cosine down to 0."""
+    """Return the learning rate of update `step`, counted from 0.
+
+    "one_cycle" (released code) rises to the peak over `warmup` of the updates and falls over the rest, each by half a
+    cosine; "cosine" (paper section 4.1) falls from the peak to 0 by half a cosine.
+    """
     updates = _num_updates(schedule)
     if schedule.kind == "cosine":
         return jnp.asarray(optax.cosine_decay_schedule(schedule.learning_rate, updates)(step))
@@ -22,7 +26,11 @@ def learning_rate(step: int | Array, schedule: ScheduleConfig) -> Array:
 
 
 def momentum(step: int | Array, schedule: ScheduleConfig) -> Array:
-    """Adam's first decay of an update, from 0: the mirror image of the learning rate in one cycle, else constant."""
+    """Return Adam's b1 of update `step`, counted from 0.
+
+    In one cycle it falls from the high end of `b1_range` to the low end while the learning rate rises, and back;
+    otherwise it is constant at the high end.
+    """
     high, low = schedule.b1_range
     return _cycle(step, schedule, high, low, high) if schedule.kind == "one_cycle" else jnp.asarray(high)
 
@@ -32,7 +40,7 @@ def _num_updates(schedule: ScheduleConfig) -> int:
 
 
 def _cycle(step: int | Array, schedule: ScheduleConfig, start: float, middle: float, end: float) -> Array:
-    """Half a cosine from `start` to `middle` over the warm-up, and half a cosine to `end` over the rest."""
+    """Go from `start` to `middle` by half a cosine over the warm-up, and to `end` by half a cosine over the rest."""
     updates = _num_updates(schedule)
     turn = int(schedule.warmup * updates)
     rise = jnp.clip(jnp.asarray(step) / max(turn, 1), 0, 1)
@@ -43,9 +51,10 @@ def _cycle(step: int | Array, schedule: ScheduleConfig, start: float, middle: fl
 
 
 def make_optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
-    """Norm clipping, Adam with the scheduled momentum, decoupled weight decay of all parameters, the learning rate.
+    """Return the optimiser: clipping by global norm, Adam with scheduled b1, decoupled weight decay of all parameters.
 
-    With `gradient_accumulation_steps` the mean gradient of that many steps makes one update; schedules count updates.
+    With `gradient_accumulation_steps` = n, every n-th step makes one update with the mean gradient of n steps, and the
+    schedules count updates.
     """
     adam = optax.inject_hyperparams(optax.scale_by_adam, static_args=("b2", "eps"))
     chain: Any = optax.chain(
@@ -56,6 +65,6 @@ def make_optimizer(schedule: ScheduleConfig) -> optax.GradientTransformation:
     )
     if schedule.gradient_accumulation_steps > 1:
         chain = optax.MultiSteps(chain, schedule.gradient_accumulation_steps)
-    # On one vector of all parameters: a program per tensor would take seconds to compile.
+    # On one vector of all parameters, because one program per tensor takes seconds to compile.
     flat = optax.flatten(optax.GradientTransformation(chain.init, chain.update))
     return optax.GradientTransformation(flat.init, flat.update)

@@ -1,7 +1,7 @@
-"""The training step as one pure function: scenes in, new state and metrics out (SPEC section 9).
+"""The training step as one pure function: state and scenes in, new state and metrics out.
 
-`train_step` runs under `jit`; under `jit` with a batch sharded over a mesh; and under `pmap` or `shard_map` with
-`axis_name`, where batch statistics, gradients and metrics are pooled over that axis.
+`train_step` runs under `jit`, also with a batch sharded over a mesh, and with `axis_name` under `pmap` or `shard_map`,
+where it pools batch statistics, gradients and metrics over that axis.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from ciassd_jax.types import LossTerms, Scene, Targets, TrainState, Variables
 
 
 def create_train_state(key: jax.Array, config: Config, *, variables: Variables | None = None) -> TrainState:
-    """A fresh state at step 0; `variables` ({"params", "batch_stats"}) replace the random ones."""
+    """Return the state at step 0, with `variables` ({"params", "batch_stats"}), by default random ones from `key`."""
     start = init_variables(key, config) if variables is None else variables
     params = jax.tree.map(jnp.asarray, start["params"])
-    # Two zeros: a step to which the state is donated may not get one buffer twice.
+    # `step` and `skipped` are separate zeros, because a donated state must not hold one buffer twice.
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         params=params,
@@ -41,11 +41,15 @@ def create_train_state(key: jax.Array, config: Config, *, variables: Variables |
 def train_step(
     state: TrainState, batch: Scene, config: Config, *, axis_name: str | None = None
 ) -> tuple[TrainState, dict[str, jax.Array]]:
-    """One update from a batch of padded scenes [B, ...]: voxelise, network, targets, losses, optimiser.
+    """Update the state from a batch of padded scenes [B, ...]: voxelise, network, targets, losses, optimiser.
 
-    `config` and `axis_name` are static. An update that is not finite is left out and counted in `skipped`: parameters,
-    optimiser and batch statistics stay. The metrics are scalars: loss terms (means over scenes), positives (anchors a
-    scene), gradient_norm before clipping, learning_rate, momentum, and the sum of every overflow count.
+    `config` and `axis_name` are static. If the loss or the gradient norm is not finite, the update is skipped:
+    parameters, optimiser state and batch statistics stay, and `skipped` counts it.
+
+    Returns the new state and scalar metrics: `loss` and its unweighted terms `classification`, `box`, `direction` and
+    `iou` (means over scenes), `positives` (positive anchors per scene), `gradient_norm` before clipping,
+    `learning_rate`, `momentum` (Adam's b1), `skipped`, and the overflow counts (sums over scenes) `points_cut`,
+    `boxes_cut`, `objects_cut`, `points_dropped`, `voxels_dropped` and `sites_dropped`.
     """
     terms_of = partial(_loss, batch=batch, config=config, axis_name=axis_name)
     (_, (terms, targets, batch_stats, counts)), gradient = jax.value_and_grad(terms_of, has_aux=True)(
@@ -54,7 +58,7 @@ def train_step(
     if axis_name is not None:
         gradient, terms = lax.pmean((gradient, terms), axis_name)
         batch_stats = lax.pmean(batch_stats, axis_name)
-    # Of one vector, as the optimizer's own clipping takes it.
+    # Of one vector, like the norm that the optimiser clips.
     norm = optax.tree.norm(jnp.concatenate([leaf.reshape(-1) for leaf in jax.tree.leaves(gradient)]))
     finite = jnp.isfinite(norm) & jnp.isfinite(terms.total)
     new_state = _update(state, gradient, batch_stats, finite, config.schedule)
@@ -78,7 +82,7 @@ def train_step(
 def _loss(
     params: Any, batch_stats: Any, *, batch: Scene, config: Config, axis_name: str | None
 ) -> tuple[jax.Array, tuple[LossTerms, Targets, Any, dict[str, jax.Array]]]:
-    """Total loss of the batch; its terms, the targets, new batch statistics and overflow counts beside it."""
+    """Return the total loss of the batch, and (terms, targets, new batch statistics, overflow counts)."""
     with jax.named_scope("voxelize"):
         voxels = voxelize_batch(batch.cloud, config.grid)
 
@@ -110,7 +114,7 @@ def _loss(
 def _update(
     state: TrainState, gradient: Any, batch_stats: Any, finite: jax.Array, schedule: ScheduleConfig
 ) -> TrainState:
-    """The state after an update, or with one more skipped."""
+    """Return the state after the update, or with the update skipped if it is not finite."""
     changes, optimizer = make_optimizer(schedule).update(gradient, state.optimizer, state.params)
     params = optax.apply_updates(state.params, changes)
     ema = state.ema

@@ -1,4 +1,4 @@
-"""Which anchor should find which truth box (SPEC section 7; paper section 4.1)."""
+"""Assignment of truth boxes to anchors (paper section 4.1)."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from ciassd_jax.types import Array, Boxes, GroundTruth, Targets
 def assign_targets(
     truth: GroundTruth, anchors: Boxes, anchor_labels: Int[Array, " A"], classes: tuple[ClassConfig, ...]
 ) -> Targets:
-    """Match the anchors of one scene to the truth boxes of their own class; `vmap` for a batch.
+    """Match the anchors of one scene to the truth boxes of their own class; `vmap` it over a batch.
 
-    An anchor is positive from its class's `matched` nearest IoU on, or if no anchor overlaps some truth box more (all
-    ties), and belongs to the first box that it overlaps most. Below `unmatched` it is negative, between ignored.
-    Boxes without volume and those that are not finite are no targets.
+    An anchor is matched to the box with which its nearest IoU is largest, the first one if several tie. It is positive
+    if that IoU is at least its class's `matched`, or if no anchor overlaps one of the boxes more. Other anchors are
+    negative below `unmatched` and ignored otherwise. Boxes with a non-positive size or non-finite numbers are not
+    matched.
     """
     labels = jnp.asarray(anchor_labels)
     iou = jnp.where(
         _usable(truth)[:, None] & (truth.label[:, None] == labels[None]), nearest_iou(truth.boxes, anchors), 0
     )
-    # Ties are ties of bits: the compiler must not compute an overlap twice in two ways.
+    # Ties are exact: the compiler must not recompute the overlaps with different rounding.
     iou = lax.optimization_barrier(iou)
     best = iou.max(0)
     rows = jnp.arange(iou.shape[0], dtype=jnp.int32)[:, None]
-    # Where the largest is first, as argmax says, which takes a CPU four times as long.
+    # The same as argmax, which takes four times as long on a CPU.
     first = jnp.where(iou == best[None], rows, iou.shape[0] - 1).min(0)
     best_of_truth = iou.max(1, keepdims=True)
     forced = jnp.any((iou == best_of_truth) & (best_of_truth > 0), 0)
@@ -47,7 +48,7 @@ def assign_targets(
 
 
 def nearest_iou(boxes: Boxes, anchors: Boxes) -> Float[Array, "G A"]:
-    """Intersection over union of the footprints of boxes and anchors, each turned to its nearest axis."""
+    """Return the BEV IoU of every box and anchor, each rotated to the nearest axis."""
     low, high = box_ops.nearest_aligned(boxes)
     anchor_low, anchor_high = box_ops.nearest_aligned(anchors)
 
@@ -61,7 +62,7 @@ def nearest_iou(boxes: Boxes, anchors: Boxes) -> Float[Array, "G A"]:
 
 
 def _usable(truth: GroundTruth) -> Bool[Array, " G"]:
-    """Real boxes of a class, with a volume, finite."""
+    """Which boxes are real, of a class, finite and of positive size."""
     rows = truth.boxes.to_array()
     real = (jnp.arange(truth.label.shape[0], dtype=jnp.int32) < truth.count) & (truth.label >= 0)
     return real & jnp.isfinite(rows).all(-1) & (truth.boxes.size > 0).all(-1)

@@ -1,4 +1,4 @@
-"""Checkpoints: what stays, what a damaged one does, and that a state comes back with the same bits."""
+"""Checkpoints: which ones are kept, damaged ones, refused ones, and states restored to the same bits."""
 
 import gc
 import json
@@ -22,7 +22,7 @@ from ciassd_jax.formats.errors import FormatWarning, InputError
 from ciassd_jax.training.checkpoint import Checkpoints, first_difference
 from ciassd_jax.types import TrainState
 
-# Where files cannot be read or written, orbax leaves what it had begun behind: coroutines and callbacks.
+# After a failed read or write, orbax leaves coroutines and callbacks behind.
 pytestmark = pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning", "ignore:coroutine:RuntimeWarning"
 )
@@ -51,7 +51,7 @@ def assert_same_bits(some: TrainState, others: TrainState) -> None:
     jax.tree.map(np.testing.assert_array_equal, some, others)
 
 
-def test_the_last_and_the_best_stay_and_come_back(tmp_path: Path, state: TrainState) -> None:
+def test_the_last_and_the_best_are_kept_and_restored(tmp_path: Path, state: TrainState) -> None:
     save(tmp_path, state, {2: 1.0, 4: 5.0, 6: 3.0, 8: None, 10: None})
     with Checkpoints(tmp_path, CONFIG, keep=2) as checkpoints:
         assert checkpoints.steps == [4, 8, 10]
@@ -61,7 +61,7 @@ def test_the_last_and_the_best_stay_and_come_back(tmp_path: Path, state: TrainSt
     assert_same_bits(restored.state, at(state, 10))
 
 
-def test_an_empty_folder_has_nothing_to_go_on_from(tmp_path: Path, state: TrainState) -> None:
+def test_an_empty_folder_has_no_checkpoint(tmp_path: Path, state: TrainState) -> None:
     with Checkpoints(tmp_path / "new", CONFIG) as checkpoints:
         assert checkpoints.restore(state) is None
 
@@ -73,7 +73,7 @@ def _truncate(folder: Path) -> None:
 
 
 def _keep_little(folder: Path) -> None:
-    """As a kill before the end would leave it under the name of a complete one."""
+    """What a kill leaves under the name of a complete checkpoint."""
     shutil.rmtree(folder)
     (folder / "state").mkdir(parents=True)
 
@@ -88,7 +88,7 @@ def _lose_progress(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [_truncate, _keep_little, _empty_data, _lose_progress])
-def test_a_damaged_checkpoint_gives_way_to_the_one_before(
+def test_a_damaged_checkpoint_is_replaced_by_the_previous_one(
     damage: Callable[[Path], None], tmp_path: Path, state: TrainState
 ) -> None:
     save(tmp_path, state, {2: None, 4: None})
@@ -108,7 +108,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(
     assert_same_bits(again.state, at(state, 4))
 
 
-def test_a_half_written_folder_is_swept_away(tmp_path: Path, state: TrainState) -> None:
+def test_a_half_written_folder_is_removed(tmp_path: Path, state: TrainState) -> None:
     save(tmp_path, state, {2: None})
     shutil.copytree(tmp_path / "2", tmp_path / "4.orbax-checkpoint-tmp")
     with Checkpoints(tmp_path, CONFIG) as checkpoints:
@@ -117,7 +117,7 @@ def test_a_half_written_folder_is_swept_away(tmp_path: Path, state: TrainState) 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["2", "4"]
 
 
-def test_only_damaged_ones_are_left_alone(tmp_path: Path, state: TrainState) -> None:
+def test_nothing_is_removed_if_all_are_damaged(tmp_path: Path, state: TrainState) -> None:
     save(tmp_path, state, {2: None, 4: None})
     for step in (2, 4):
         _empty_data(tmp_path / str(step))
@@ -134,6 +134,47 @@ def test_another_config_is_refused_with_its_first_difference(tmp_path: Path, sta
         pytest.raises(InputError, match=r"config\.loss\.iou_weight is 1\.0 there and 2\.0 here"),
     ):
         checkpoints.restore(state)
+
+
+def edit_progress(folder: Path, edit: Callable[[dict], object]) -> None:
+    """Change what a checkpoint holds beside the state."""
+    path = folder / "progress" / "metadata"
+    progress = json.loads(path.read_text())
+    edit(progress)
+    path.write_text(json.dumps(progress))
+
+
+def test_a_run_of_an_earlier_format_is_refused_and_kept(tmp_path: Path, state: TrainState) -> None:
+    save(tmp_path, state, {2: None, 4: None})
+    for step in (2, 4):
+        edit_progress(tmp_path / str(step), lambda progress: progress.pop("format"))
+    before = sorted(path for path in tmp_path.rglob("*"))
+    with (
+        Checkpoints(tmp_path, CONFIG) as checkpoints,
+        pytest.raises(InputError, match=r"/4 was written by another version .*last\.safetensors\.$"),
+    ):
+        checkpoints.restore(state)
+    assert sorted(path for path in tmp_path.rglob("*")) == before
+
+
+def test_fields_that_a_saved_config_lacks_take_their_defaults(tmp_path: Path, state: TrainState) -> None:
+    save(tmp_path, state, {2: None})
+    edit_progress(tmp_path / "2", lambda progress: progress["config"]["schedule"].pop("remat"))
+    with Checkpoints(tmp_path, CONFIG) as checkpoints:
+        assert checkpoints.restore(state) is not None
+    with (
+        Checkpoints(tmp_path, replace(CONFIG, schedule=replace(CONFIG.schedule, remat=True))) as checkpoints,
+        pytest.raises(InputError, match=r"config\.schedule\.remat is False there and True here"),
+    ):
+        checkpoints.restore(state)
+
+
+def test_a_field_of_a_later_version_is_named(tmp_path: Path, state: TrainState) -> None:
+    save(tmp_path, state, {2: None})
+    edit_progress(tmp_path / "2", lambda progress: progress["config"]["loss"].update(new_weight=1.0))
+    with Checkpoints(tmp_path, CONFIG) as checkpoints, pytest.raises(InputError, match="new_weight"):
+        checkpoints.restore(state)
+    assert (tmp_path / "2").is_dir()
 
 
 @pytest.mark.parametrize(
@@ -166,7 +207,7 @@ def test_restores_on_another_number_of_devices(tmp_path: Path, state: TrainState
 
 @contextmanager
 def limited_files(size: int) -> Iterator[None]:
-    """No file may grow beyond so many bytes: what a full disk looks like."""
+    """Limit the size of files in bytes, which fails like a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -175,11 +216,11 @@ def limited_files(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_full_disk_is_one_sentence_and_leaves_the_earlier_ones(
+def test_a_failed_write_is_one_sentence_and_keeps_the_earlier_ones(
     tmp_path: Path, state: TrainState, caplog: pytest.LogCaptureFixture
 ) -> None:
     save(tmp_path, state, {2: None})
-    # Pages of traces would not fit the limit where output is caught in a file.
+    # Pages of traces would exceed the limit if the output goes to a file.
     for name in ("absl", "asyncio"):
         caplog.set_level("CRITICAL", name)
     with limited_files(20_000), pytest.raises(InputError, match=r"cannot be written to .* \(File too large\)"):
@@ -190,7 +231,19 @@ def test_a_full_disk_is_one_sentence_and_leaves_the_earlier_ones(
     assert_same_bits(restored.state, at(state, 2))
 
 
-def test_a_folder_that_cannot_be_is_refused(tmp_path: Path) -> None:
+def test_a_disk_with_too_little_space_is_not_written_to(tmp_path: Path, state: TrainState) -> None:
+    save(tmp_path, state, {2: None})
+    # 4 PB that need no memory.
+    huge = at(state, 4)._replace(ema=np.broadcast_to(np.float32(0), 10**15))
+    with (
+        Checkpoints(tmp_path, CONFIG) as checkpoints,
+        pytest.raises(InputError, match=r"cannot be written to .* \(No space left on device\); free some space"),
+    ):
+        checkpoints.save(huge, LOADER)
+    assert [path.name for path in tmp_path.iterdir()] == ["2"]
+
+
+def test_a_folder_that_cannot_be_created_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a file"):
         Checkpoints(tmp_path / "file" / "checkpoints", CONFIG)
@@ -207,6 +260,6 @@ def test_the_config_is_readable(tmp_path: Path, state: TrainState) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _left_behind() -> Iterator[None]:
-    """Collect it while this module's filter holds."""
+    """Collect the garbage while this module's filter of warnings holds."""
     yield
     gc.collect()
