@@ -6,7 +6,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import jaxlib
+from xla_flags import xla_flags
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # A program compiled by one test serves the others, also in other workers and in processes that tests start.
@@ -33,13 +33,8 @@ def pytest_configure(config: pytest.Config) -> None:
     The quick suite spends its time in the compiler, so it skips the costly passes. Any other selection of tests
     (`-m slow`, `-m reference`) runs the programs that users run.
     """
-    flags = "--xla_force_host_platform_device_count=2"
-    if config.option.markexpr == "not slow":
-        flags += " --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-        # XLA aborts on a flag that it does not know.
-        if jaxlib.version.__version_info__ < (0, 12):
-            flags += " --xla_cpu_use_fusion_emitters=false"
-    os.environ.setdefault("XLA_FLAGS", flags)
+    level = 0 if config.option.markexpr == "not slow" else None
+    os.environ.setdefault("XLA_FLAGS", xla_flags(devices=2, level=level))
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@
 
 Prints one JSON line: whether a checkpoint of one device has the same bits on four and the other way round; and for
 every case the largest difference of gradients (relative to the largest gradient of a leaf), parameters, batch
-statistics and metrics (relative). Run by test_training.py in a process of its own.
+statistics and metrics (relative). Run by test_step.py in a process of its own.
 """
 
 import json
@@ -12,10 +12,10 @@ import os
 import sys
 import tempfile
 
-# The programs run twice each, so that optimising them fully would take most of the time.
-os.environ["XLA_FLAGS"] = (
-    "--xla_force_host_platform_device_count=8 --xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
-)
+from xla_flags import xla_flags
+
+# The programs run twice each: optimising them fully would take most of the time.
+os.environ["XLA_FLAGS"] = xla_flags(devices=8, level=1)
 os.environ["JAX_PLATFORMS"] = "cpu"
 
 from dataclasses import replace

@@ -1,8 +1,8 @@
-"""One of several processes that train together; `test_parallel.py` starts them.
+"""One of several processes that train together; `test_distributed.py` starts them.
 
-`python tests/processes.py update OUT [COORDINATOR COUNT INDEX]` makes one update of the small network in float64, and
-writes gradients, parameters and metrics to OUT; `train STOP ARGUMENTS` is `ciassd train` of the small network in place
-of `tiny`, which gets SIGTERM in the step after STOP (0: never).
+`python tests/processes.py update OUT [COORDINATOR COUNT INDEX]` makes one update of the small network in float64 and
+writes gradients, parameters and metrics to OUT. `train STOP ARGUMENTS` runs `ciassd train` with the small network in
+place of `tiny`, and sends itself SIGTERM in step STOP (0: never).
 """
 
 import os
@@ -11,13 +11,11 @@ import sys
 from functools import partial
 from pathlib import Path
 
-# Eight devices, unless one each is asked for below.
 from devices import CONFIG, gradient_of, scenes
+from xla_flags import xla_flags
 
-# Not optimised at all, one update in float64 takes longer than its compilation.
-os.environ["XLA_FLAGS"] = (
-    f"--xla_backend_optimization_level={int(sys.argv[1] == 'update')} --xla_cpu_use_fusion_emitters=false"
-)
+# After `devices`, which asks for eight. At level 0 one update in float64 takes longer than its compilation.
+os.environ["XLA_FLAGS"] = xla_flags(devices=1, level=int(sys.argv[1] == "update"))
 
 import jax
 import numpy as np
@@ -31,7 +29,7 @@ from ciassd_jax.training import distributed
 
 
 def update(out: Path) -> None:
-    """An update of eight scenes, of which each process has its share."""
+    """Make one update of eight scenes, which the processes share."""
     jax.config.update("jax_enable_x64", True)
     batch, (index, count) = scenes("one empty"), distributed.shard()
     share = len(batch.frame) // count
@@ -48,14 +46,15 @@ def update(out: Path) -> None:
 
 
 def train(stop: int, arguments: list[str]) -> int:
+    """Run `ciassd train`, with SIGTERM before the step `stop`."""
     PRESETS["tiny"] = mini_config
-    place, taken = distributed.shard_batch, []
+    original, calls = distributed.shard_batch, []
 
     def shard_batch(*given):
-        taken.append(None)
-        if len(taken) == stop:
+        calls.append(None)
+        if len(calls) == stop:
             signal.raise_signal(signal.SIGTERM)
-        return place(*given)
+        return original(*given)
 
     distributed.shard_batch = shard_batch
     return main(["train", *arguments])
