@@ -1,4 +1,4 @@
-"""Configs as frozen dataclasses: `model` and `training` hold the sections, `presets` the named detectors."""
+"""Configs as frozen dataclasses. The sections are in `model` and `training`, the named configs in `presets`."""
 
 from ciassd_jax.config.config import Config
 from ciassd_jax.config.model import (

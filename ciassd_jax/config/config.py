@@ -1,4 +1,4 @@
-"""`Config`: a whole detector."""
+"""`Config`: everything that defines a detector and its training."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ciassd_jax.config.training import DataConfig, LossConfig, ScheduleConfig
 
 @dataclass(frozen=True)
 class Config:
-    """A whole detector. The defaults are the paper's (`car()`)."""
+    """Everything that defines a detector and its training. The defaults are the paper's, `car()`."""
 
     grid: GridConfig = field(default_factory=GridConfig)
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
@@ -34,13 +34,13 @@ class Config:
     detection: DetectionConfig = field(default_factory=DetectionConfig)
     data: DataConfig = field(default_factory=DataConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    # Compute type of the network; parameters, BatchNorm, coordinates, IoU and NMS stay float32. "float64" is for exact
-    # comparisons and needs jax_enable_x64.
+    # Type of the convolutions; parameters, BatchNorm, coordinates, IoU and NMS stay float32. "float64" serves exact
+    # comparisons and needs `jax_enable_x64`.
     dtype: Literal["float32", "bfloat16", "float64"] = "float32"
 
     def __post_init__(self) -> None:
         if not self.classes or len({c.name for c in self.classes}) != len(self.classes):
-            raise ValueError("classes: at least one is needed, each with its own name.")
+            raise ValueError("classes: give at least one, each with its own name.")
         if self.dtype not in ("float32", "bfloat16", "float64"):
             raise ValueError(f"dtype: {self.dtype!r} is unknown; choose 'float32', 'bfloat16' or 'float64'.")
         multiple = 2 * self.backbone.stride
@@ -49,7 +49,7 @@ class Config:
                 below = cells // multiple * multiple
                 raise ValueError(
                     f"grid.{axis}: {cells} voxels are not divisible by {multiple} ({self.backbone.stride} voxels "
-                    f"per BEV cell, halved once more in the neck); the nearest valid count is "
+                    f"per BEV cell, and the neck halves the map); the nearest valid count is "
                     f"{f'{below} or ' if below else ''}{below + multiple}."
                 )
         depths = [shape[0] for shape in self.backbone.stage_shapes(self.grid.shape)]
@@ -61,7 +61,7 @@ class Config:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Names in label order: label 0 is the first."""
+        """Names of the classes in the order of their labels."""
         return tuple(c.name for c in self.classes)
 
     @property
@@ -71,51 +71,51 @@ class Config:
 
     @property
     def bev_channels(self) -> int:
-        """Channels of the BEV map: the z layers folded into the features."""
+        """Channels of the BEV map, with the z layers folded into them."""
         return self.backbone.out_channels * self.backbone.stage_shapes(self.grid.shape)[-1][0]
 
     @property
     def anchors_per_cell(self) -> int:
-        """One anchor for every class and angle."""
+        """Number of anchors per BEV cell: one for each class and angle."""
         return len(self.classes) * len(self.head.angles)
 
     def to_json(self) -> str:
-        """The whole config as JSON text."""
+        """Return the config as JSON text."""
         return json.dumps(asdict(self), indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> Config:
-        """Read `to_json`'s text, or that of an earlier version.
+        """Read a config from the text of `to_json`, of this or an earlier version.
 
-        A missing field takes its default. Raises ValueError, one sentence that names the field, for an unknown field
-        and for a wrong type.
+        A missing field has its default. Raises ValueError, naming the field, for an unknown field and for a value of
+        the wrong type or range.
         """
         try:
             data = json.loads(text)
         except json.JSONDecodeError as error:
-            raise ValueError(f"The config is no valid JSON ({error}).") from error
+            raise ValueError(f"The config is not valid JSON ({error}).") from error
         return rebuild(cls, _without_first_capacity(data), "config")
 
     def for_inference(self) -> Config:
-        """The config with every field that `predict` does not read at its default.
+        """Return the config with the default for every field that `predict` does not read.
 
-        Configs that differ in training alone become equal, so that a program compiled for one serves the others.
+        Configs that differ only in training become equal, so that they share one compiled program.
         """
         unread = {name: getattr(_UNREAD_CLASS, name) for name in _UNREAD_CLASS_FIELDS}
         classes = tuple(replace(one, **unread) for one in self.classes)
         return replace(self, classes=classes, loss=LossConfig(), data=DataConfig(), schedule=ScheduleConfig())
 
 
-# Leaves no array behind: `jax.jit` takes a config as an argument without `static_argnames`.
+# A pytree without leaves: `jax.jit` treats a config as static without `static_argnames`.
 jax.tree_util.register_static(Config)
 
-# What only matching, sampling and evaluation read of a class.
+# Fields of a class that only target assignment, ground-truth sampling and evaluation read.
 _UNREAD_CLASS_FIELDS = ("matched", "unmatched", "similar", "gt_sampling_up_to", "gt_sampling_min_points")
 _UNREAD_CLASS = ClassConfig()
 
 
 def _without_first_capacity(data: Any) -> Any:
-    """Parsed JSON without the first stage's capacity, which earlier versions wrote as a copy of `grid.max_voxels`."""
+    """Return parsed JSON without the first stage's capacity, which in earlier versions repeated `grid.max_voxels`."""
     try:
         first, max_voxels = data["backbone"]["stages"][0], data["grid"]["max_voxels"]
         if first["capacity"] != max_voxels:

@@ -1,4 +1,4 @@
-"""Configs as JSON: checked against the annotations of the dataclasses, with the field names of earlier versions."""
+"""Read configs from JSON: check values against the annotations, and accept the field names of earlier versions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typing
 from collections.abc import Iterable
 from typing import Any, Literal
 
-# Fields that had another name in files of earlier versions, by section: old name to new name.
+# Old name to new name of the fields that earlier versions named differently, by section.
 RENAMED = {
     "AugmentationConfig": {"paste": "gt_sampling"},
     "DataConfig": {"max_paste_points": "max_gt_sampling_points"},
@@ -29,8 +29,8 @@ RENAMED = {
 def rebuild(kind: Any, data: Any, where: str) -> Any:
     """Build a value of the annotated type from parsed JSON.
 
-    A missing field takes its default, and a field may have the name of an earlier version. Raises ValueError, one
-    sentence that names the field, for an unknown field and for a value that is not as annotated.
+    `where` is the path of the value, for messages. A missing field has its default, and a field may have the name of an
+    earlier version. Raises ValueError, naming the field, for an unknown field and for a value of another type.
     """
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
@@ -43,7 +43,7 @@ def rebuild(kind: Any, data: Any, where: str) -> Any:
             raise ValueError(f"{where}: expected {len(kinds)} values, not {len(data)}.")
         return tuple(rebuild(k, item, f"{where}[{i}]") for i, (k, item) in enumerate(zip(kinds, data, strict=True)))
     if origin is Literal:
-        # True == 1 == 1.0, but only one of them is meant.
+        # True == 1 == 1.0, so compare the types too.
         if not any(type(data) is type(argument) and data == argument for argument in arguments):
             raise ValueError(f"{where}: {data!r} is not one of {list(arguments)}.")
         return data
@@ -78,6 +78,6 @@ def _rebuild_dataclass(kind: Any, data: Any, where: str) -> Any:
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:
-    """The known name most like a name, or all known names."""
+    """Return the most similar known name, or all known names."""
     close = difflib.get_close_matches(name, known, 1)
     return f"did you mean '{close[0]}'" if close else f"known are {', '.join(sorted(known))}"

@@ -1,6 +1,6 @@
-"""What a detector is, as frozen dataclasses of numbers and tuples; `presets.py` has the named ones.
+"""The sections of a config that define the detector: grid, network, classes and post-processing.
 
-A config is hashable (a static argument of jit), says why a value is refused, and round-trips through JSON.
+Every section is a frozen, hashable dataclass of numbers, strings and tuples. It raises ValueError for a wrong value.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class GridConfig:
-    """The voxel grid; x, y, z in metres (SPEC section 3; paper section 4.1)."""
+    """The voxel grid, in metres along x, y, z (paper section 4.1)."""
 
     minimum: tuple[float, float, float] = (0.0, -40.0, -3.0)
     maximum: tuple[float, float, float] = (70.4, 40.0, 1.0)
     voxel_size: tuple[float, float, float] = (0.05, 0.05, 0.1)
     max_points_per_voxel: int = 5
     max_voxels: int = 20000
-    # What happens to the points that come after the last voxel was given out: "skip" leaves out new voxels
-    # only, "stop" ignores every later point, as the released code does.
+    # When max_voxels are in use, "skip" ignores points in further voxels; "stop" ignores every point after the first
+    # such point, as the released code does.
     overflow: Literal["skip", "stop"] = "skip"
 
     def __post_init__(self) -> None:
@@ -28,12 +28,12 @@ class GridConfig:
             if not (size > 0 and 0 < high - low < math.inf):
                 raise ValueError(
                     f"grid.{axis}: range {low}..{high} with voxel size {size} is empty or "
-                    "endless; the maximum must exceed the minimum, both finite, and the voxel size be positive."
+                    "unbounded; the maximum must exceed the minimum, both must be finite, and the voxel size positive."
                 )
             cells = (high - low) / size
             if round(cells) < 1 or abs(cells - round(cells)) > 1e-3:
                 raise ValueError(
-                    f"grid.{axis}: {high - low:g} m is {cells:.3f} voxels of {size} m, which is no whole number; "
+                    f"grid.{axis}: {high - low:g} m is {cells:.3f} voxels of {size} m, not a whole number; "
                     f"the nearest valid maximum is {low + max(round(cells), 1) * size:g}."
                 )
         if self.max_points_per_voxel < 1 or self.max_voxels < 1:
@@ -43,7 +43,7 @@ class GridConfig:
         depth, height, width = self.shape
         if depth * height * width >= 2**31:
             raise ValueError(
-                f"grid: {depth} x {height} x {width} voxels do not fit the 32-bit keys of the sparse "
+                f"grid: {depth} x {height} x {width} voxels exceed the 32-bit keys of the sparse "
                 "convolutions; use larger voxels or a smaller range."
             )
 
@@ -58,14 +58,14 @@ class GridConfig:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape (z, y, x) of the sparse grid: one empty layer on top, as in SECOND."""
+        """Shape (z, y, x) of the sparse grid, with one empty layer on top as in SECOND."""
         x, y, z = self.cells
         return z + 1, y, x
 
 
 @dataclass(frozen=True)
 class StageConfig:
-    """One resolution of the backbone: a strided convolution into it (none for the first), then submanifold ones.
+    """One resolution of the backbone: a strided convolution (none in the first stage), then submanifold convolutions.
 
     `capacity` is the number of site slots. The first stage has none: its sites are the voxels, `grid.max_voxels`.
     """
@@ -95,12 +95,12 @@ class BackboneConfig:
     )
     out_channels: int = 64
     out_capacity: int = 16000
-    # "gather" computes active sites only; "dense" the whole grid: the definition, for small grids and tests.
+    # "gather" computes active sites only. "dense" computes the whole grid; it is the definition, for small grids.
     backend: Literal["gather", "dense"] = "gather"
 
     def __post_init__(self) -> None:
         if not self.stages:
-            raise ValueError("backbone: at least one stage is needed.")
+            raise ValueError("backbone: give at least one stage.")
         first, *others = (stage.capacity for stage in self.stages)
         if first is not None:
             raise ValueError(
@@ -109,13 +109,13 @@ class BackboneConfig:
             )
         if None in others:
             raise ValueError(
-                f"backbone.stages[{1 + others.index(None)}].capacity is missing; only the first stage has none."
+                f"backbone.stages[{1 + others.index(None)}].capacity is missing; only that of the first stage is None."
             )
         if self.backend not in ("gather", "dense"):
             raise ValueError(f"backbone: backend {self.backend!r} is unknown; choose 'gather' or 'dense'.")
 
     def stage_shapes(self, shape: tuple[int, int, int]) -> tuple[tuple[int, int, int], ...]:
-        """Grid shape (z, y, x) of every stage and of the output, from the shape of the input."""
+        """Return the grid shape (z, y, x) of every stage and of the output, from that of the input."""
         shapes = [shape]
         for stage in self.stages[1:]:
             depth, height, width = shapes[-1]
@@ -125,7 +125,7 @@ class BackboneConfig:
         return tuple(shapes)
 
     def capacities(self, max_voxels: int) -> tuple[int, ...]:
-        """Site slots of every stage and of the output."""
+        """Return the number of site slots of every stage and of the output."""
         return (max_voxels, *(stage.capacity or 0 for stage in self.stages[1:]), self.out_capacity)
 
     @property
@@ -136,11 +136,10 @@ class BackboneConfig:
 
 @dataclass(frozen=True)
 class NeckConfig:
-    """From the BEV map to the head's features.
+    """The neck, from the BEV map to the features of the head.
 
-    "ssfa" is the paper's (section 3.2, SPEC section 5), whose semantic branch has twice the spatial channels. Table 4
-    compares it with the others: "second" has seven 3 x 3 convolutions, "sassd" seven of twice the channels and one of
-    1 x 1.
+    "ssfa" is the paper's (section 3.2); its semantic branch has twice the channels. The others are the baselines of
+    Table 4: "second" has seven 3 x 3 convolutions, "sassd" seven of twice the channels and one of 1 x 1.
     """
 
     kind: Literal["ssfa", "second", "sassd"] = "ssfa"
@@ -156,22 +155,23 @@ class NeckConfig:
 
 @dataclass(frozen=True)
 class ClassConfig:
-    """One class and its anchor: size in metres, height of the anchor's centre, matching thresholds."""
+    """One class: its anchor (size and height of the centre in metres), thresholds, and ground-truth sampling."""
 
     name: str = "Car"
     width: float = 1.6
     length: float = 3.9
     height: float = 1.56
     center_z: float = -1.0
+    # Overlap with a truth box from which an anchor is positive, and below which it is negative.
     matched: float = 0.6
     unmatched: float = 0.45
-    # A detection needs this much IoU-weighted support (mu of Algorithm 1).
+    # A detection needs more IoU-weighted support than this (mu of Algorithm 1).
     support_threshold: float = 2.6
-    # Label names that count as this class in training (paper section 4.1: vans are cars).
+    # Labels that count as this class in training (paper section 4.1: vans as cars).
     similar: tuple[str, ...] = ()
-    # Objects are pasted until a scene holds so many of this name, none for 0 (SPEC section 2.3).
+    # Ground-truth sampling adds objects until a scene has this number of the class; 0 adds none.
     gt_sampling_up_to: int = 0
-    # A database object needs so many points.
+    # Fewest points of an object that is sampled.
     gt_sampling_min_points: int = 5
 
     def __post_init__(self) -> None:
@@ -190,22 +190,22 @@ CAR = ClassConfig(similar=("Van",), gt_sampling_up_to=15)
 
 @dataclass(frozen=True)
 class HeadConfig:
-    """Multi-task head (paper section 3.3, SPEC section 6); `angles` are the anchors' r in radians."""
+    """The multi-task head (paper section 3.3); `angles` are r of the anchors, in radians."""
 
     angles: tuple[float, ...] = (0.0, math.pi / 2)
-    # Without the IoU branch every box counts as a perfect one: the confidence is the class probability.
+    # Without the IoU branch q is 1 for every box, so the confidence is the class probability.
     predict_iou: bool = True
     iou_kernel: Literal[1, 3] = 1
     iou_bias: bool = True
 
     def __post_init__(self) -> None:
         if not self.angles or self.iou_kernel not in (1, 3):
-            raise ValueError(f"head {self}: at least one angle is needed, and iou_kernel must be 1 or 3.")
+            raise ValueError(f"head {self}: give at least one angle; iou_kernel must be 1 or 3.")
 
 
 @dataclass(frozen=True)
 class DetectionConfig:
-    """From raw predictions to boxes (paper section 3.4 and Algorithm 1, SPEC section 10)."""
+    """From raw predictions to boxes (paper section 3.4 and Algorithm 1)."""
 
     score_threshold: float = 0.3
     max_candidates: int = 1000
@@ -213,7 +213,8 @@ class DetectionConfig:
     clamp_iou: bool = True
     nms: Literal["paper", "released", "rotated"] = "paper"
     nms_iou_threshold: float = 0.3
-    # sigma squared of the Gaussian weight for boxes nearer than each distance; the last serves all beyond.
+    # sigma squared of the Gaussian weight (equation 8) for boxes nearer than each distance in metres, and beyond the
+    # last. With nms="released" there are no boxes from the last distance on.
     sigma_squared: tuple[float, float, float, float] = (0.0009, 0.009, 0.1, 1.0)
     sigma_distances: tuple[float, float, float] = (20.0, 40.0, 60.0)
     z_limits: tuple[float, float] = (-5.0, 5.0)

@@ -1,4 +1,4 @@
-"""The named detectors, each a config."""
+"""The named configs."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from ciassd_jax.config import (
 
 
 def car() -> Config:
-    """The paper's car detector on KITTI, with every open point decided as in the README's table."""
+    """The paper's car detector on KITTI; METHOD.md, section 1, lists what the paper leaves open and the choice made."""
     return Config()
 
 
 def car_released() -> Config:
-    """The authors' released code, quirks included: with their weights it gives their boxes."""
+    """The authors' released code, quirks included; with their weights it gives their boxes."""
     config = car()
     return replace(
         config,
@@ -37,15 +37,15 @@ def car_released() -> Config:
 
 
 def car_lite() -> Config:
-    """The same method sized for a CPU: about ten frames a second on two cores (benchmarks/README.md).
+    """The same method sized for a CPU: about ten frames per second on two cores (benchmarks/README.md).
 
-    Voxels of twice the size quarter the BEV map to cells of 0.8 m, where the neck spends its time, and leave two
-    thirds of the sites. Half the neck's width quarters its arithmetic again. A map of 0.4 m with a neck of 32
-    channels would cost half as much again: convolutions of so few channels run on one core. The second stage, with
-    the most sites, only strides.
+    Voxels of twice the size give BEV cells of 0.8 m: a quarter of the cells and two thirds of the sites. Half the
+    channels quarter the arithmetic of the neck, which takes most of the time. Cells of 0.4 m with a neck of 32 channels
+    would take half as long again, since convolutions of few channels run on one core. The second stage has the most
+    sites and therefore no submanifold convolution.
     """
     return Config(
-        # A map of cells of twice the size has a quarter of the boxes around a car that could support one another.
+        # With cells of twice the size, a quarter of the boxes around a car support one another.
         classes=(replace(CAR, support_threshold=CAR.support_threshold / 4),),
         grid=GridConfig(voxel_size=(0.1, 0.1, 0.2), max_voxels=14000),
         backbone=BackboneConfig(
@@ -64,7 +64,7 @@ def car_lite() -> Config:
 
 
 def three_class() -> Config:
-    """Car, pedestrian and cyclist; not in the paper and not tuned."""
+    """Cars, pedestrians and cyclists; not in the paper and not tuned."""
     pedestrian = ClassConfig(
         name="Pedestrian",
         width=0.6,
@@ -79,7 +79,7 @@ def three_class() -> Config:
 
 
 def tiny() -> Config:
-    """A toy of the same shape for tests and notebooks: 12.8 m x 12.8 m, a few thousand parameters."""
+    """A toy of the same structure for tests and notebooks: 12.8 m x 12.8 m, 53 thousand parameters."""
     return Config(
         grid=GridConfig(
             minimum=(0.0, -6.4, -3.0), maximum=(12.8, 6.4, 1.0), voxel_size=(0.1, 0.1, 0.2), max_voxels=2048

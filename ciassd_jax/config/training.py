@@ -1,4 +1,4 @@
-"""The sections of a config that only training reads: data, losses, optimiser and schedule."""
+"""The sections of a config that only training reads: data, losses, optimizer and schedule."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class AugmentationConfig:
-    """The five switches of the paper's Table 3, and their numbers (paper section 4.1, SPEC section 2)."""
+    """The five switches of the paper's Table 3, and the numbers of each augmentation (paper section 4.1)."""
 
     global_transform: bool = True
     object_noise: bool = True
     gt_sampling: bool = True
     similar_classes: bool = True
-    # Objects harder than hard stay out of the database; `filter_scenes` leaves them out of the scenes too.
+    # Keep objects that are not easy, moderate or hard out of the database, and with `filter_scenes` out of the scenes.
     difficulty_filter: bool = True
     filter_scenes: bool = False
     flip_probability: float = 0.5
     max_rotation: float = 0.785
     min_scale: float = 0.95
     max_scale: float = 1.05
-    # Standard deviation of an object's shift in metres, its largest turn in radians, and the tries it has.
+    # Noise of each object: standard deviation of the shift in metres, largest turn in radians, and number of tries.
     noise_shift: tuple[float, float, float] = (1.0, 1.0, 0.5)
     noise_rotation: float = 0.785
     noise_tries: int = 100
@@ -38,7 +38,7 @@ class AugmentationConfig:
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Capacities of a labelled scene, and its augmentation."""
+    """Capacities of a labelled scene, and augmentation."""
 
     max_points: int = 32768
     max_boxes: int = 64
@@ -52,7 +52,7 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights beside the classification's 1 (omega, mu, lambda; paper section 3.3) and shapes of the losses."""
+    """Weights of the losses, that of the classification being 1, and their shapes (paper section 3.3)."""
 
     box_weight: float = 2.0
     direction_weight: float = 0.2
@@ -74,15 +74,15 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class ScheduleConfig:
-    """The optimiser and how long it runs (SPEC section 9): Adam with decoupled decay, norm clipping, one cycle."""
+    """The optimizer and its schedule: Adam with decoupled weight decay, gradient clipping, one cycle."""
 
     # 60 epochs of KITTI's 3712 frames in batches of 4.
     total_steps: int = 55680
     batch_size: int = 4
     kind: Literal["one_cycle", "cosine"] = "one_cycle"
     learning_rate: float = 3e-3
-    # One cycle: the rate starts at 1 / div_factor of its peak, ends at 1 / final_div_factor of that start, and rises
-    # for this share of the steps, while the momentum goes from high to low and back.
+    # One cycle: the learning rate starts at 1 / div_factor of its peak, rises for this share of the steps, and ends at
+    # 1 / final_div_factor of its start. Meanwhile b1 goes from the first value of b1_range to the second and back.
     warmup: float = 0.4
     div_factor: float = 10.0
     final_div_factor: float = 1e4
@@ -90,11 +90,11 @@ class ScheduleConfig:
     b2: float = 0.99
     weight_decay: float = 0.01
     max_gradient_norm: float = 35.0
-    # Gradients of so many batches make one update.
+    # Number of batches per update.
     gradient_accumulation_steps: int = 1
-    # Decay of the running mean of the parameters; 0 for none.
+    # Decay of the running mean of the parameters; 0 keeps none.
     ema_decay: float = 0.0
-    # Compute activations again in the backward pass instead of keeping them.
+    # Recompute activations in the backward pass instead of storing them.
     remat: bool = False
 
     def __post_init__(self) -> None:

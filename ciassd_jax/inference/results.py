@@ -1,4 +1,4 @@
-"""Detections of one frame as NumPy arrays, as rows and as files."""
+"""Detections of one frame: as NumPy arrays, label rows, pictures and files."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 class FrameResult:
     """Detections of one frame as NumPy arrays.
 
-    `boxes` [N, 7] are x, y, z, length, width, height (metres) and yaw in [-pi, pi), in the LiDAR frame and the order
-    of selection; `labels` are class names; `seconds` is the time from points to boxes without compilation.
+    `boxes` [N, 7] are x, y, z, length, width, height in metres and yaw in [-pi, pi), in the LiDAR frame, in the order
+    of selection. `labels` are class names, `counts` the numbers of points, voxels, sites and candidates used and
+    dropped, `seconds` the time from points to boxes without compilation.
     """
 
     boxes: np.ndarray
@@ -56,13 +57,13 @@ class FrameResult:
         return "\n".join([head, *rows, *more])
 
     def plot_bev(self, points: np.ndarray, truth: np.ndarray | None = None) -> Figure:
-        """Bird's-eye view of points [N, 4], these and true boxes [G, 7]: a matplotlib figure that notebooks show."""
+        """Return a bird's-eye view of the points [N, 4], these boxes and true boxes [G, 7], as a matplotlib figure."""
         from ciassd_jax.view.bev import plot_bev
 
         return plot_bev(np.asarray(points), self.boxes, truth, self.scores, self.labels)
 
     def view(self, points: np.ndarray, truth: np.ndarray | None = None, *, name: str = "points") -> Page:
-        """These boxes, the points [N, 4] and true boxes [G, 7] in 3D: a page; notebooks show it, `.save(path)`."""
+        """Return a 3D page of the points [N, 4], these boxes and true boxes [G, 7]; `.save(path)` writes it."""
         from ciassd_jax.view.html import view_html
         from ciassd_jax.view.view_frame import NO_BOXES, ViewFrame
 
@@ -71,15 +72,15 @@ class FrameResult:
         return view_html([frame], title=name)
 
     def rows(self, camera: Camera) -> tuple[list[ObjectRow], Int[np.ndarray, " kept"]]:
-        """KITTI's rows of the boxes seen in the image, and the indices of those boxes."""
+        """Return KITTI's rows of the boxes that the image shows, and the indices of those boxes."""
         return boxes_to_rows(Boxes.from_array(self.boxes), self.scores, self.labels, *camera)
 
     def show_in(self, frame: ViewFrame) -> ViewFrame:
-        """The frame to look at, with these boxes as its detections."""
+        """Return the frame with these boxes as its detections."""
         return frame._replace(boxes=self.boxes, scores=self.scores, labels=self.labels)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists, ready for JSON."""
+        """Return plain numbers, strings and lists, ready for JSON."""
         return {
             "boxes": self.boxes.tolist(),
             "scores": self.scores.tolist(),
@@ -90,7 +91,7 @@ class FrameResult:
 
 
 def frame_result(batch: Detections, config: Config, seconds: float) -> FrameResult:
-    """The detections of a batch of one scene, which took so long, as NumPy arrays."""
+    """Return the detections of a batch of one scene, which took `seconds`, as NumPy arrays."""
     scene = jax.tree.map(lambda leaf: np.asarray(leaf[0]), batch)
     count = int(scene.count)
     labels = tuple(config.class_names[label] for label in scene.label[:count])
@@ -100,9 +101,9 @@ def frame_result(batch: Detections, config: Config, seconds: float) -> FrameResu
 
 
 def write_result(result: FrameResult, name: str, folder: Pathlike, camera: Camera | None = None) -> list[Path]:
-    """Write `folder/NAME.json` and, with a camera, KITTI's rows as `folder/NAME.txt`; returns the paths.
+    """Write `folder/NAME.json` and, with a camera, KITTI's rows as `folder/NAME.txt`; return the paths.
 
-    Each file appears whole or not at all. Raises InputError where that fails.
+    Each file is written whole or not at all. Raises InputError if it cannot be written.
     """
     written = [write_json(Path(folder) / f"{name}.json", result)]
     if camera is not None:
@@ -114,14 +115,14 @@ def write_result(result: FrameResult, name: str, folder: Pathlike, camera: Camer
 
 
 def write_json(path: Path, result: FrameResult) -> Path:
-    """Write one result as JSON, whole or not at all."""
+    """Write one result as JSON, whole or not at all; return the path."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(result.to_dict()) + "\n", encoding="utf-8")
     return path
 
 
 def _plain_counts(counts: Counts) -> dict[str, Any]:
-    """Counts of one scene as nested plain numbers."""
+    """Return the counts of one scene as nested plain numbers."""
     value = {name: np.asarray(leaf).tolist() for name, leaf in counts._asdict().items()}
     return {
         "points": {name: value[f"points_{name}"] for name in ("given", "in_range", "dropped")},

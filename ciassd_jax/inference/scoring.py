@@ -1,4 +1,4 @@
-"""A detector over a labelled data set: its detections, their files, and their average precision."""
+"""Run a detector over a labelled data set, write its detections, and compute their average precision."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.types import Boxes
 
-# Weights that training writes to its folder, in order of preference: the best by validation, and the last.
+# Weights in the folder of a training, in order of preference: the best by validation, and the last.
 TRAINED = ("best.safetensors", "last.safetensors")
 
 
 class Scored(NamedTuple):
-    """The labels and detections of a frame as they are evaluated, and the detections as lines of a file.
+    """The labels and detections of a frame, ready for evaluation, and the detections as lines of a file.
 
-    `lines` have the columns of the data set's labels with the score last: KITTI's with a camera; without one x, y, z,
-    length, width, height, yaw in the LiDAR frame, and the class. All numbers have 4 decimals.
+    With a camera, `lines` are KITTI's rows. Without one they are x, y, z, length, width, height and yaw in the LiDAR
+    frame, the class, and the score. Numbers have 4 decimals.
     """
 
     name: str
@@ -48,23 +48,23 @@ def score_dataset(
 
 
 def score_frames(frames: Sequence[Scored]) -> Evaluation:
-    """Return the average precision by KITTI's rules; without a camera, difficulty is by the points in a box."""
+    """Return the average precision by KITTI's rules. Without a camera, the points in a box define its difficulty."""
     return evaluate([frame.truth for frame in frames], [frame.detections for frame in frames])
 
 
 def detect_dataset(
     detector: Detector, dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
 ) -> list[Scored]:
-    """Detect in every frame of a data set; with a camera only in its view.
+    """Detect objects in every frame of a data set; in a frame with a camera only those in its view.
 
-    `track` wraps the iteration over the names, for a progress bar. One FormatWarning per kind tells what frames lack,
-    and one DroppedWarning what the program dropped, summed over all frames. Raises InputError for a frame that cannot
-    be read or has no labels.
+    `track` wraps the iteration over the names, for a progress bar. Gives one FormatWarning for each kind of problem
+    with the frames, and one DroppedWarning with everything that was dropped, summed over the frames. Raises InputError
+    for a frame that cannot be read or has no labels.
     """
     scored: list[Scored] = []
     for frame, truth in labelled_frames(dataset, track):
         with warnings.catch_warnings():
-            # The counts of the results say the same.
+            # `describe_dropped` sums the same counts over all frames.
             warnings.filterwarnings("ignore", "Dropped ", DroppedWarning)
             result = detector(frame.points, frustum=frustum_of(frame.camera))
         scored.append(score_frame(frame, truth, result))
@@ -76,7 +76,7 @@ def detect_dataset(
 def labelled_frames(
     dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
 ) -> Iterator[tuple[Frame, LabelledObjects]]:
-    """Yield the frames of a data set with the labels to score against; warnings and errors as in `detect_dataset`."""
+    """Yield each frame of a data set and its labels; warnings and errors are those of `detect_dataset`."""
     lacking: dict[str, list[str]] = {}
     for index, _ in enumerate(track(dataset.names)):
         with warnings.catch_warnings(record=True) as caught:
@@ -91,12 +91,12 @@ def labelled_frames(
                 warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
         yield frame, truth
     for first, *others in lacking.values():
-        likewise = f" Other frames likewise: {len(others)}." if others else ""
-        warnings.warn(first + likewise, FormatWarning, stacklevel=3)
+        more = f" Other frames with this problem: {len(others)}." if others else ""
+        warnings.warn(first + more, FormatWarning, stacklevel=3)
 
 
 def describe_dropped(frames: Sequence[Scored]) -> str:
-    """Return a sentence on what was dropped, summed over the frames; empty if nothing was."""
+    """Return a sentence that lists what was dropped, summed over the frames; empty if nothing was."""
     dropped = _dropped(frames)
     return f"Dropped {'; '.join(dropped)}." if dropped else ""
 
@@ -118,29 +118,29 @@ def score_frame(frame: Frame, truth: LabelledObjects, result: FrameResult) -> Sc
 
 
 def write_frames(frames: Sequence[Scored], folder: Pathlike) -> None:
-    """Write the lines of every frame to `folder/NAME.txt`; a frame without detections gives an empty file."""
+    """Write the lines of each frame to `folder/NAME.txt`; a frame without detections gives an empty file."""
     for frame in frames:
         with replacing(Path(folder) / f"{frame.name}.txt") as path:
             path.write_text("".join(f"{line}\n" for line in frame.lines), encoding="utf-8", newline="\n")
 
 
 def find_trained(workdir: Pathlike) -> Path:
-    """Return the first of TRAINED that exists in the folder of a training; raises InputError without any."""
+    """Return the path of the first of TRAINED in the folder of a training; raise InputError if there is none."""
     for name in TRAINED:
         if (Path(workdir) / name).is_file():
             return Path(workdir) / name
-    raise InputError(f"{workdir} has neither {' nor '.join(TRAINED)}; name the folder of a training that saved some.")
+    raise InputError(f"{workdir} has neither {' nor '.join(TRAINED)}; give the folder of a training with weights.")
 
 
 def _kind(text: str, sources: Iterable[Path]) -> str:
-    """Return a warning without its files and numbers, which is the same for all frames."""
+    """Return the text of a warning without files and numbers, so that it is equal for all frames."""
     for path in sources:
         text = text.replace(str(path), "")
     return re.sub(r"\d[\d.e+]*", "", text)
 
 
 def _dropped(frames: Sequence[Scored]) -> list[str]:
-    """Return what was dropped, summed over the frames, one phrase per reason."""
+    """Return one phrase per reason, with the number dropped in all frames."""
     amounts: dict[str, list[int]] = {}
     for frame in frames:
         counts = frame.result.counts
@@ -149,7 +149,7 @@ def _dropped(frames: Sequence[Scored]) -> list[str]:
             lost[f"sites of backbone stage {stage} beyond its capacity"] = sites["dropped"]
         lost["candidates beyond detection.max_candidates"] = counts["candidates"]["dropped"]
         points = counts["points"]
-        lost["points where none is in range"] = 0 if points["in_range"] else points["given"]
+        lost["points of frames without a point in range"] = 0 if points["in_range"] else points["given"]
         for reason, amount in lost.items():
             amounts.setdefault(reason, []).append(amount)
     return [

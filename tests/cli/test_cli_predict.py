@@ -284,7 +284,7 @@ def test_a_released_safetensors_is_for_convert_only(run: Any, tmp_path: Path) ->
     arguments = (tmp_path / "good.bin", "--weights", tmp_path / "released.safetensors", "--out", tmp_path / "out")
     result = run("predict", *arguments)
     assert (result.code, result.out) == (2, "")
-    assert re.search(r"make a file of ours with `ciassd convert \S+ OUT\.safetensors`", result.err)
+    assert re.search(r"released\.safetensors .*`ciassd convert \S+ OUT\.safetensors`", result.err)
 
 
 def test_a_failed_write_leaves_no_part_of_a_file(run: Any, weights: Path, tmp_path: Path, monkeypatch: Any) -> None:

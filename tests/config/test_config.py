@@ -215,19 +215,19 @@ def test_json_with_a_wrong_field_is_refused(path, value, sentence):
 
 
 @pytest.mark.parametrize("text", ["", "{", "not json", "[1, 2"])
-def test_text_that_is_no_json_is_refused(text):
-    with pytest.raises(ValueError, match="The config is no valid JSON"):
+def test_text_that_is_not_json_is_refused(text):
+    with pytest.raises(ValueError, match="config is not valid JSON"):
         Config.from_json(text)
 
 
 @pytest.mark.parametrize("text", ["[]", "3", "null", '"car"'])
-def test_json_that_is_no_config_is_refused(text):
+def test_json_that_is_not_a_config_is_refused(text):
     with pytest.raises(ValueError, match=r"config: expected the fields \['backbone', 'classes'"):
         Config.from_json(text)
 
 
 @pytest.mark.parametrize("path", ["detection", "neck.channels", "schedule.remat", "dtype"])
-def test_a_missing_field_takes_its_default(path):
+def test_a_missing_field_has_its_default(path):
     assert Config.from_json(edited(path, ...)) == car()
 
 
@@ -321,10 +321,10 @@ def no_type_checks():
             {"maximum": (70.4, -41.0, 1.0)},
             r"grid\.y: range -40\.0\.\.-41\.0 with voxel size 0\.05 is empty",
         ),
-        (GridConfig, {"voxel_size": (0.05, 0.05, 0.0)}, r"grid\.z: .*the voxel size be positive"),
-        (GridConfig, {"voxel_size": (0.05, -0.05, 0.1)}, r"grid\.y: .*the voxel size be positive"),
-        (GridConfig, {"maximum": (math.inf, 40.0, 1.0)}, r"grid\.x: .*both finite"),
-        (GridConfig, {"minimum": (0.0, -40.0, math.nan)}, r"grid\.z: .*both finite"),
+        (GridConfig, {"voxel_size": (0.05, 0.05, 0.0)}, r"grid\.z: .*voxel size positive"),
+        (GridConfig, {"voxel_size": (0.05, -0.05, 0.1)}, r"grid\.y: .*voxel size positive"),
+        (GridConfig, {"maximum": (math.inf, 40.0, 1.0)}, r"grid\.x: .*both must be finite"),
+        (GridConfig, {"minimum": (0.0, -40.0, math.nan)}, r"grid\.z: .*both must be finite"),
         (GridConfig, {"maximum": (70.42, 40.0, 1.0)}, r"grid\.x: 70\.42 m is 1408\.400 voxels .*maximum is 70\.4\."),
         (GridConfig, {"voxel_size": (0.05, 0.05, 0.3)}, r"grid\.z: 4 m is 13\.333 voxels of 0\.3 m.*maximum is 0\.9\."),
         (GridConfig, {"max_voxels": 0}, "max_points_per_voxel and max_voxels must be at least 1"),
@@ -335,7 +335,7 @@ def no_type_checks():
         (StageConfig, {"channels": 1, "layers": -1, "capacity": 1}, "backbone stage .*layers at least 0"),
         (StageConfig, {"channels": 1, "layers": 1, "capacity": 0}, "backbone stage .*capacity must be at least 1"),
         (StageConfig, {"channels": 1, "layers": 1, "capacity": 1, "z_padding": 2}, "backbone stage .*z_padding 0 or 1"),
-        (BackboneConfig, {"stages": ()}, "backbone: at least one stage"),
+        (BackboneConfig, {"stages": ()}, "backbone: give at least one stage"),
         (BackboneConfig, {"backend": "cuda"}, "backbone: backend 'cuda' is unknown; choose 'gather' or 'dense'"),
         (NeckConfig, {"kind": "fpn"}, "neck.kind: 'fpn' is unknown; choose 'ssfa', 'second' or 'sassd'"),
         (NeckConfig, {"channels": 0}, "neck .*channels must be at least 1"),
@@ -360,7 +360,7 @@ def no_type_checks():
         (DetectionConfig, {"nms": "soft"}, r"detection\.nms: 'soft' .* choose 'paper', 'released' or 'rotated'"),
         (DetectionConfig, {"sigma_squared": (0.1, 0.0, 0.1, 1.0)}, "detection: sigma_squared must be positive"),
         (DetectionConfig, {"sigma_distances": (20.0, 60.0, 40.0)}, "detection: .*sigma_distances ascending"),
-        (Config, {"classes": ()}, "classes: at least one is needed"),
+        (Config, {"classes": ()}, "classes: give at least one"),
         (Config, {"classes": (ClassConfig(), ClassConfig())}, "classes: .*each with its own name"),
         (Config, {"dtype": "float16"}, "dtype: 'float16' is unknown; choose 'float32', 'bfloat16' or 'float64'"),
         (Config, {"grid": GridConfig(maximum=(70.0, 40.0, 1.0))}, r"grid\.x: 1400 voxels .* 1392 or 1408\."),
@@ -385,7 +385,7 @@ def test_a_wrong_value_is_refused_with_the_remedy(kind, given, sentence):
         {"nms": "rotated"},
     ],
 )
-def test_values_at_the_limit_are_taken(given):
+def test_values_at_the_limit_are_accepted(given):
     config = DetectionConfig(**given)
     assert Config.from_json(replace(car(), detection=config).to_json()).detection == config
 

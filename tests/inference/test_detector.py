@@ -174,15 +174,13 @@ def test_from_pretrained_reads_a_file(tmp_path: Path) -> None:
     assert loaded.config == config
 
 
-def test_from_pretrained_says_which_names_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_from_pretrained_names_the_available_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ciassd_jax.inference.weights.BUNDLED", tmp_path)
-    with pytest.raises(
-        InputError, match=r"'car_best' names no bundled weights \(none are bundled yet\); give the path"
-    ):
+    with pytest.raises(InputError, match=r"'car_best' \(available: none\); .*the path"):
         Detector.from_pretrained("car_best")
     config = small_config()
     save_weights(tmp_path / "small.safetensors", random_variables(config), config)
-    with pytest.raises(InputError, match="bundled are small"):
+    with pytest.raises(InputError, match=r"'car_best' \(available: small\)"):
         Detector.from_pretrained("car_best")
     assert Detector.from_pretrained("small").config == config
 

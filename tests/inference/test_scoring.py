@@ -206,7 +206,7 @@ def test_frames_without_labels_are_refused(tmp_path: Path) -> None:
         detect_dataset(Oracle(nothing), open_dataset(root, "test"))
 
 
-def test_what_frames_lack_is_said_once(tmp_path: Path) -> None:
+def test_problems_of_frames_are_reported_once(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
     for name in NAMES:
         path = root / f"training/velodyne/{name}.bin"
@@ -217,7 +217,7 @@ def test_what_frames_lack_is_said_once(tmp_path: Path) -> None:
         detect_dataset(Oracle(all_objects), open_dataset(root, "all"))
     texts = [str(one.message) for one in caught]
     assert len(texts) == 2
-    assert re.search(r"000000\.bin has intensities of .* Other frames likewise: 2\.$", texts[0])
+    assert re.search(r"000000\.bin has intensities of .* Other frames .*: 2\.$", texts[0])
     assert re.search(r"000001\.bin: 1 of 980 points are not finite; they were left out\.$", texts[1])
 
 
@@ -245,13 +245,13 @@ def test_drops_are_summed(tmp_path: Path) -> None:
     assert text.startswith(f"Dropped {voxels[1]} voxels beyond grid.max_voxels (in 1 of 3 frames); ")
     sites = sum(frame.result.counts["sites"][0]["dropped"] for frame in frames)
     assert f"; {sites} sites of backbone stage 1 beyond its capacity (in 1 of 3 frames)" in text
-    assert text.endswith("; 2 points where none is in range (in 1 of 3 frames).")
+    assert text.endswith("; 2 points of frames without a point in range (in 1 of 3 frames).")
     assert [len(frame.lines) for frame in frames] == [len(frame.detections.score) for frame in frames]
     assert len(frames[0].lines) > 0
 
 
 def test_the_best_of_a_training_is_taken(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"has neither best\.safetensors nor last\.safetensors; name the folder"):
+    with pytest.raises(InputError, match=r"has neither best\.safetensors nor last\.safetensors; give the folder"):
         find_trained(tmp_path)
     for name in ("last", "best"):
         (tmp_path / f"{name}.safetensors").touch()
