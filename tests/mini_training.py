@@ -1,4 +1,4 @@
-"""A training of a few steps on synthetic frames; as a program it trains in the folder that it is given."""
+"""A training of a few steps on a few made-up frames; `python tests/mini_training.py DATA WORKDIR` runs it."""
 
 import sys
 from collections.abc import Callable
@@ -24,7 +24,7 @@ INTERVALS = Intervals(log=1, save=2, evaluate=4, keep=2)
 
 
 def mini_config(steps: int = STEPS) -> Config:
-    """`small_config()` with a running mean of the weights, so that every part of a state is there."""
+    """`small_config()` with a moving average of the weights, so that the state has every part."""
     config = small_config()
     return replace(
         config,
@@ -47,7 +47,7 @@ def mini_batches(root: Path, config: Config, **options: Any) -> Batches:
 
 
 def mini_fit(root: Path, workdir: Path, log: Callable[[str], object] = lambda text: None, **options: Any) -> Fitted:
-    """Frames, weights, order and augmentation are the same every time."""
+    """Train with the same frames, weights, order and augmentation every time."""
     config = mini_config()
     chosen = {"variables": random_variables(config), "intervals": INTERVALS, "log": log} | options
     batches = chosen.pop("batches", None) or mini_batches(root, config)
@@ -58,7 +58,7 @@ def share_training_programs(monkeypatch: pytest.MonkeyPatch, programs: dict[Any,
     """Compile the step of a config once for all trainings that share `programs`."""
 
     def compile_once(self: Any, batch: Any) -> Any:
-        # The step does not read how the data is made.
+        # The step does not depend on how the data is made.
         key = replace(self.config, data=DataConfig()), batch.frame.sharding, len(batch.frame)
         if key not in programs:
             programs[key] = _compile(self, batch)

@@ -1,4 +1,4 @@
-"""Slow references of targets and losses: one anchor after the other, in the paper's r."""
+"""Slow references of targets and losses: loops over anchors, with the paper's angle r."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Limits = tuple[float, float]
 
 
 def aligned(box: np.ndarray) -> tuple[float, float, float, float]:
-    """x and y limits of (x, y, z, w, l, h, r) turned to its nearest axis."""
+    """(x0, y0, x1, y1) of the box (x, y, z, w, l, h, r) rotated to the nearest axis."""
     x, y, _, width, length, _, r = (float(value) for value in box)
     if abs(r - math.floor(r / math.pi + 0.5) * math.pi) > math.pi / 4:
         width, length = length, width
@@ -18,7 +18,7 @@ def aligned(box: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def nearest_iou_by_loop(boxes: np.ndarray, anchors: np.ndarray) -> np.ndarray:
-    """Nearest IoU (A, G) as float32, from boxes and anchors of the paper's seven numbers."""
+    """Nearest IoU [A, G] in float32, from boxes and anchors (x, y, z, w, l, h, r)."""
     result = np.zeros((len(anchors), len(boxes)), np.float32)
     sides = [aligned(box) for box in boxes]
     for i, anchor in enumerate(anchors):
@@ -32,7 +32,7 @@ def nearest_iou_by_loop(boxes: np.ndarray, anchors: np.ndarray) -> np.ndarray:
 
 
 def assign_by_loop(iou: np.ndarray, matched: float, unmatched: float) -> tuple[np.ndarray, np.ndarray]:
-    """Label and matched box of every anchor of one class, from its IoU (A, G) with the boxes of the class."""
+    """Label and matched box of every anchor of one class, from its IoU [A, G] with the boxes of that class."""
     label, owner = np.zeros(len(iou), int), np.full(len(iou), -1)
     if not iou.size:
         return label, owner

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ciassd_jax.simulation.materials import material
-from ciassd_jax.simulation.solids import Solids, block, ellipsoid, solid, stack
+from ciassd_jax.simulation.solids import Number, Solids, block, ellipsoid, solid, stack
 from ciassd_jax.types import Array
 
 NUM_STYLES = 8
@@ -72,7 +72,7 @@ def _car(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
     screens = (-1.0 - 0.5 * style[4], recede, -0.25, -0.03)
     roof = height - belt
 
-    def cabin(low: Array | float, grow: float, name: str) -> Solids:
+    def cabin(low: Number, grow: float, name: str) -> Solids:
         limits = (glass + grow, front - lid + grow - 0.05, side - 0.04 + grow, roof - 0.01 + grow, low)
         return solid((0, 0, belt), limits, material(name), lean=screens, shade=paint if name == "paint" else 1.0)
 
@@ -165,7 +165,7 @@ def _truck(size: Float[Array, " 3"], style: Float[Array, " n"]) -> Solids:
     )
 
 
-def _wheels(ahead: Array, behind: Array, side: Array, radius: Array | float, half_width: float) -> list[Solids]:
+def _wheels(ahead: Array, behind: Array, side: Array, radius: Number, half_width: float) -> list[Solids]:
     """Four wheels, flush with the sides of the vehicle."""
     limits = (radius, radius, half_width, radius, radius)
     radii = (radius, jnp.inf, radius)
@@ -176,7 +176,7 @@ def _wheels(ahead: Array, behind: Array, side: Array, radius: Array | float, hal
     ]
 
 
-def _plates(front: Array, rear_height: Array | float) -> list[Solids]:
+def _plates(front: Array, rear_height: Number) -> list[Solids]:
     """Two licence plates, which are retroreflective."""
     size = (0.04, 0.5, 0.11)
     return [

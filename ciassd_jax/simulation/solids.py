@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from ciassd_jax.types import Array
 
+Number = Array | float | int
 # Smallest rate and curvature: a ray parallel to a face meets it far away instead of dividing by zero.
 _FLAT = 1e-9
 
@@ -39,13 +40,13 @@ class Solids(NamedTuple):
 
 
 def solid(
-    origin: tuple[Array | float, Array | float, Array | float],
-    limits: tuple[Array | float, ...],
+    origin: tuple[Number, Number, Number],
+    limits: tuple[Number, ...],
     material: int,
     *,
-    lean: tuple[Array | float, ...] = (0.0, 0.0, 0.0, 0.0),
-    radii: tuple[Array | float, ...] = (jnp.inf, jnp.inf, jnp.inf),
-    shade: Array | float = 1.0,
+    lean: tuple[Number, ...] = (0.0, 0.0, 0.0, 0.0),
+    radii: tuple[Number, ...] = (jnp.inf, jnp.inf, jnp.inf),
+    shade: Number = 1.0,
 ) -> Solids:
     """Return one solid, aligned with its object; `radii` are those of the ellipsoid, infinite for none."""
     return Solids(
@@ -61,19 +62,19 @@ def solid(
     )
 
 
-def block(center: tuple, size: tuple, material: int, **more: Array | float | tuple) -> Solids:
+def block(center: tuple, size: tuple, material: int, **more: Number | tuple) -> Solids:
     """Return a box of (length, width, height) around `center`."""
     length, width, height = (edge / 2 for edge in size)
     return solid(center, (length, length, width, height, height), material, **more)  # type: ignore[arg-type]
 
 
-def column(base: tuple, radius: Array | float, height: Array | float, material: int) -> Solids:
+def column(base: tuple, radius: Number, height: Number, material: int) -> Solids:
     """Return an upright cylinder on `base`."""
     limits = (radius, radius, radius, height, 0.0)
     return solid(base, limits, material, radii=(radius, radius, jnp.inf))
 
 
-def ellipsoid(center: tuple, radii: tuple, material: int, **more: Array | float) -> Solids:
+def ellipsoid(center: tuple, radii: tuple, material: int, **more: Number) -> Solids:
     """Return an ellipsoid around `center`."""
     limits = (radii[0], radii[0], radii[1], radii[2], radii[2])
     return solid(center, limits, material, radii=radii, **more)  # type: ignore[arg-type]
@@ -92,7 +93,7 @@ def place(solids: Solids, position: Float[Array, " 3"], yaw: Float[Array, ""]) -
     return solids._replace(origin=turned + position[None], yaw=solids.yaw + yaw)
 
 
-def _row(values: tuple[Array | float, ...]) -> Array:
+def _row(values: tuple[Number, ...]) -> Array:
     return jnp.stack([jnp.asarray(value, jnp.float32) for value in values])
 
 

@@ -231,7 +231,7 @@ def street_with(more: Solids) -> World:
     """A car 15 m ahead on flat ground, and one more solid."""
     size = np.float32([4.0, 1.7, 1.5])
     parts = build_vehicle(size, np.int32(CAR), np.full(NUM_STYLES, 0.5, np.float32))
-    car = place(parts, np.float32([15.0, 0.0, -1.73]), np.float32(0))
+    car = place(parts, np.float32([15.0, 0.0, -1.73]), jnp.float32(0))
     car = car._replace(owner=np.zeros_like(car.owner))
     boxes = Boxes(np.float32([[15.0, 0.0, -0.98]]), size[None], np.zeros(1, np.float32))
     solids = jax.tree.map(lambda some, one: np.append(some, one[None], 0), car, more)

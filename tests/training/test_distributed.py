@@ -1,4 +1,4 @@
-"""Several devices and several processes: the same update, one stop, and a folder that either goes on with."""
+"""Several devices and processes: the same update, a common stop, and checkpoints that any number of them resumes."""
 
 import json
 import socket
@@ -56,12 +56,12 @@ def test_two_processes_make_the_same_update(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_processes_stop_together_and_one_goes_on(tmp_path: Path) -> None:
+def test_two_processes_stop_together_and_one_resumes(tmp_path: Path) -> None:
     data, workdir = write_data(tmp_path / "data"), tmp_path / "run"
     options = ("--preset", "tiny", "--data", data, "--workdir", workdir, "--batch-size", 2, "--steps", 6)
     options += ("--log-every", 1, "--evaluate-every", 2)
     together = ("--coordinator", f"localhost:{free_port()}", "--num-processes", 2, "--process-index")
-    # Only the second process is told to stop.
+    # Only the second process gets the signal.
     first, second = run_together(*(("train", 4 * index, *options, *together, index) for index in range(2)))
     assert (first[0], second[0]) == (143, 143), (first, second)
     assert "Compiled the step of 2 scenes for 2 cpu devices of 2 processes in " in first[1]
@@ -69,15 +69,15 @@ def test_two_processes_stop_together_and_one_goes_on(tmp_path: Path) -> None:
     assert "step" not in second[1]
     assert "Traceback" not in first[2] + second[2]
 
-    ((code, said, errors),) = run_together(("train", 0, *options))
+    ((code, logged, errors),) = run_together(("train", 0, *options))
     assert code == 0, errors
-    assert "Resuming from step 4 in " in said
+    assert "Resuming from step 4 in " in logged
     lines = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == [1, 2, 3, 4, 5, 6]
     assert [line["step"] for line in lines if "score" in line] == [3, 6]
 
 
-def test_a_single_process_takes_as_many_devices_as_divide_the_batch() -> None:
+def test_a_single_process_uses_as_many_devices_as_divide_the_batch() -> None:
     assert len(jax.devices()) == 2
     for batch_size, devices, words in (
         (4, 2, "2 cpu devices"),
@@ -103,7 +103,7 @@ def test_several_processes_must_share_a_batch_evenly(monkeypatch: pytest.MonkeyP
         (("auto", None, None), "cannot be reached"),
     ],
 )
-def test_a_coordinator_that_cannot_be_is_one_sentence(given: tuple, words: str) -> None:
+def test_an_unusable_coordinator_is_one_sentence(given: tuple, words: str) -> None:
     with pytest.raises(ParallelError, match=words):
         connect(*given)
 
@@ -118,5 +118,5 @@ def test_a_coordinator_that_cannot_be_is_one_sentence(given: tuple, words: str) 
         ({"TPU_WORKER_HOSTNAMES": "one,two"}, True),
     ],
 )
-def test_a_cluster_is_known_by_its_environment(environment: dict[str, str], several: bool) -> None:
+def test_a_cluster_is_recognised_by_its_environment(environment: dict[str, str], several: bool) -> None:
     assert distributed._is_cluster(environment) is several

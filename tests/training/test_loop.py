@@ -1,4 +1,4 @@
-"""The training loop: what it leaves in its folder, and that a run that was cut off ends with the same bits."""
+"""The training loop: the files of its folder, and interrupted runs that resume to the same bits."""
 
 import json
 import signal
@@ -23,11 +23,12 @@ from mini_training import (
 )
 from small import random_variables
 
-from ciassd_jax import create_train_state, load_weights, open_dataset
+from ciassd_jax import create_train_state, load_weights, make_batches, open_dataset, open_synthetic
 from ciassd_jax.data.gt_sampling import find_database
 from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import InputError
 from ciassd_jax.model.network import variables_of
+from ciassd_jax.simulation import Lidar
 from ciassd_jax.training import loop
 from ciassd_jax.training.checkpoint import Checkpoints
 from ciassd_jax.training.loop import Fitted, Intervals, TrainingError, fit
@@ -45,7 +46,7 @@ def _compiled_once() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _interruptible() -> Iterator[None]:
-    """Ctrl-C as at a terminal: in the background of a shell it is ignored."""
+    """Handle SIGINT as at a terminal; in a background job it is ignored."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -58,10 +59,10 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Fitted, Path, list[str]]:
-    """A run that nothing cut off, its folder and what it said."""
-    workdir, said = tmp_path_factory.mktemp("whole") / "new", []
+    """An uninterrupted run, its folder and its log."""
+    workdir, logged = tmp_path_factory.mktemp("whole") / "new", []
     validation = open_dataset(root, "val")
-    return mini_fit(root, workdir, said.append, validation=validation), workdir, said
+    return mini_fit(root, workdir, logged.append, validation=validation), workdir, logged
 
 
 def assert_same_bits(some: TrainState, others: TrainState) -> None:
@@ -70,7 +71,7 @@ def assert_same_bits(some: TrainState, others: TrainState) -> None:
 
 
 def lines(workdir: Path) -> list[dict[str, Any]]:
-    """The lines of the record without its times and evaluations."""
+    """The lines of the metrics without times and evaluations."""
     found = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
     return [{name: value for name, value in line.items() if name != "seconds"} for line in found if "loss" in line]
 
@@ -84,8 +85,8 @@ def saved_state(workdir: Path) -> TrainState:
     return restored.state
 
 
-def test_the_folder_has_everything(whole: tuple[Fitted, Path, list[str]]) -> None:
-    fitted, workdir, said = whole
+def test_the_folder_is_complete(whole: tuple[Fitted, Path, list[str]]) -> None:
+    fitted, workdir, logged = whole
     assert int(fitted.state.step) == STEPS
     assert fitted.stopped is None
     names = {path.name for path in workdir.iterdir()}
@@ -100,11 +101,11 @@ def test_the_folder_has_everything(whole: tuple[Fitted, Path, list[str]]) -> Non
     assert {path.name for path in (workdir / "eval" / "9").iterdir()} == {"data", "result.json", "table.txt"}
     assert (workdir / "eval" / "9" / "data" / "000000.txt").is_file()
     assert {"8", "9"} <= {path.name for path in (workdir / "checkpoints").iterdir()}
-    assert sum(text.startswith("Compiled the step of 2 scenes for 2 cpu devices in ") for text in said) == 1
-    assert sum("tensorboardX" in text for text in said) == 1
+    assert sum(text.startswith("Compiled the step of 2 scenes for 2 cpu devices in ") for text in logged) == 1
+    assert sum("tensorboardX" in text for text in logged) == 1
 
 
-def test_the_record_has_every_step_and_scores(whole: tuple[Fitted, Path, list[str]]) -> None:
+def test_the_metrics_have_every_step_and_scores(whole: tuple[Fitted, Path, list[str]]) -> None:
     fitted, workdir, _ = whole
     assert [line["step"] for line in lines(workdir)] == list(range(1, STEPS + 1))
     assert lines(workdir)[2]["epoch"] == 2
@@ -120,13 +121,23 @@ def test_the_weights_are_those_of_the_last_step(whole: tuple[Fitted, Path, list[
     fitted, workdir, _ = whole
     weights = load_weights(workdir / "last.safetensors")
     assert weights.config == mini_config()
-    # The running mean, as this config has one.
+    # The moving average of the weights, which this config asks for.
     jax.tree.map(np.testing.assert_array_equal, weights.variables, variables_of(fitted.state))
     assert_same_bits(saved_state(workdir), fitted.state)
 
 
+def test_validates_on_synthetic_frames(tmp_path: Path) -> None:
+    frames = open_synthetic(seed=3, frames=2, lidar=Lidar(columns=128))
+    batches = make_batches(frames, mini_config(), seed=3, batch_size=2)
+    fitted = mini_fit(tmp_path, tmp_path, batches=batches, validation=frames, intervals=Intervals(log=STEPS))
+    *_, line = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert json.loads(line)["score"] == fitted.best == json.loads(line)["Car_3d_0.70_moderate_R40"]
+    written = {path.name for path in (tmp_path / "eval" / str(STEPS) / "data").iterdir()}
+    assert written == {"000000.txt", "000001.txt"}
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_stopped_run_goes_on_with_the_same_bits(
+def test_a_stopped_run_resumes_to_the_same_bits(
     number: int, whole: tuple[Fitted, Path, list[str]], root: Path, tmp_path: Path
 ) -> None:
     handlers = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
@@ -138,23 +149,23 @@ def test_a_stopped_run_goes_on_with_the_same_bits(
     stopped = mini_fit(root, tmp_path, stop)
     assert (int(stopped.state.step), stopped.stopped) == (3, number)
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == handlers
-    said: list[str] = []
-    resumed = mini_fit(root, tmp_path, said.append)
-    assert said[0].startswith("Resuming from step 3 in ")
+    logged: list[str] = []
+    resumed = mini_fit(root, tmp_path, logged.append)
+    assert logged[0].startswith("Resuming from step 3 in ")
     assert_same_bits(resumed.state, whole[0].state)
     assert lines(tmp_path) == lines(whole[1])
-    # There is nothing left to do.
+    # A complete run has nothing left to do.
     assert_same_bits(mini_fit(root, tmp_path).state, whole[0].state)
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_with_the_same_bits(
+def test_a_killed_run_resumes_to_the_same_bits(
     whole: tuple[Fitted, Path, list[str]], root: Path, tmp_path: Path
 ) -> None:
     program = Path(__file__).parents[1] / "mini_training.py"
     process = subprocess.Popen([sys.executable, str(program), str(root), str(tmp_path)], stderr=subprocess.PIPE)
     checkpoints, deadline = tmp_path / "checkpoints", time.monotonic() + 300
-    # The next checkpoint may be half-written when the first is complete.
+    # Kill it after the first checkpoint, while the next one may be half-written.
     while process.poll() is None and time.monotonic() < deadline:
         if checkpoints.is_dir() and any(path.name.isdigit() for path in checkpoints.iterdir()):
             break
@@ -162,22 +173,22 @@ def test_a_killed_run_goes_on_with_the_same_bits(
     process.kill()
     _, errors = process.communicate()
     assert process.returncode == -signal.SIGKILL, errors.decode()
-    said: list[str] = []
-    resumed = mini_fit(root, tmp_path, said.append)
-    assert said[0].startswith("Resuming from step "), said
+    logged: list[str] = []
+    resumed = mini_fit(root, tmp_path, logged.append)
+    assert logged[0].startswith("Resuming from step "), logged
     assert_same_bits(resumed.state, whole[0].state)
     assert lines(tmp_path) == lines(whole[1])
 
 
-def test_a_label_that_is_none_is_named_and_the_rest_is_saved(root: Path, tmp_path: Path) -> None:
+def test_an_invalid_label_is_named_and_the_state_is_saved(root: Path, tmp_path: Path) -> None:
     dataset, config = open_dataset(root, "train"), mini_config()
     batches = mini_batches(root, config)
-    taken = []
+    names = []
 
     def read(name: str) -> Any:
         frame = dataset.read_frame(name)
-        taken.append(name)
-        if len(taken) > 10:
+        names.append(name)
+        if len(names) > 10:
             frame.boxes.size[0] = np.nan
         return frame
 
@@ -206,11 +217,14 @@ def test_a_dead_worker_loses_no_step(
     assert_same_bits(mini_fit(root, tmp_path).state, whole[0].state)
 
 
-def test_losses_that_stay_not_finite_end_it(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("log", [1, 4])
+def test_updates_that_stay_non_finite_end_it(
+    log: int, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(loop, "_MAX_SKIPPED", 4)
     broken = jax.tree.map(lambda leaf: leaf * np.float32(np.nan), random_variables(mini_config()))
     with pytest.raises(TrainingError, match="last 4 updates were not finite"):
-        mini_fit(root, tmp_path, variables=broken, intervals=Intervals(log=4))
+        mini_fit(root, tmp_path, variables=broken, intervals=Intervals(log=log))
     assert lines(tmp_path)[-1]["loss"] is None
 
 
@@ -221,7 +235,7 @@ def test_another_stream_is_refused(whole: tuple[Fitted, Path, list[str]], root: 
     assert len(lines(whole[1])) == STEPS
 
 
-def test_lines_after_the_step_and_cut_ones_go(tmp_path: Path) -> None:
+def test_later_and_truncated_lines_are_removed(tmp_path: Path) -> None:
     written = "".join(f'{{"step": {step}, "score": {step}.5}}\n' for step in (2, 4, 6))
     (tmp_path / "metrics.jsonl").write_text(f'{written}{{"step": 8, "sco')
     log = MetricsLog(tmp_path, 4, lambda text: None)
@@ -234,7 +248,7 @@ def test_lines_after_the_step_and_cut_ones_go(tmp_path: Path) -> None:
     ]
 
 
-def test_events_go_to_tensorboard_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_events_are_written_if_tensorboardx_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple] = []
 
     class Writer:
@@ -255,32 +269,32 @@ def test_events_go_to_tensorboard_where_it_is(tmp_path: Path, monkeypatch: pytes
 
 
 def test_the_database_is_found_or_built(root: Path, tmp_path: Path) -> None:
-    dataset, said = open_dataset(root, "train"), []
+    dataset, logged = open_dataset(root, "train"), []
     stale = tmp_path / "stale.bin"
     stale.write_bytes(b"no database")
-    built = find_database(dataset, [stale, tmp_path / "built.bin"], log=said.append)
-    assert (built.path, len(said)) == (tmp_path / "built.bin", 1)
-    again = find_database(dataset, [stale, tmp_path / "built.bin"], log=said.append)
-    assert (again.path, len(said)) == (tmp_path / "built.bin", 1)
+    built = find_database(dataset, [stale, tmp_path / "built.bin"], log=logged.append)
+    assert (built.path, len(logged)) == (tmp_path / "built.bin", 1)
+    again = find_database(dataset, [stale, tmp_path / "built.bin"], log=logged.append)
+    assert (again.path, len(logged)) == (tmp_path / "built.bin", 1)
     assert stale.read_bytes() == b"no database"
 
 
-def test_intervals_that_are_none_are_refused() -> None:
+def test_intervals_out_of_range_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 1"):
         Intervals(save=0)
 
 
-def test_a_second_signal_acts_as_ever() -> None:
-    with deferred_signals() as noted:
+def test_a_second_signal_gets_the_previous_handler() -> None:
+    with deferred_signals() as received:
         signal.raise_signal(signal.SIGINT)
-        assert noted == [signal.SIGINT]
+        assert received == [signal.SIGINT]
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
 
 
 def test_an_ignored_signal_stays_ignored() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with deferred_signals() as noted:
+    with deferred_signals() as received:
         signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    assert noted == []
+    assert received == []

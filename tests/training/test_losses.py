@@ -1,4 +1,4 @@
-"""Losses against the released code's numbers, values and gradients by hand, and what no input may break."""
+"""Losses: the released code's numbers, values and gradients by hand, and robustness to any input."""
 
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -30,7 +30,7 @@ from ciassd_jax.training.losses import (
 from ciassd_jax.training.targets import assign_targets
 from ciassd_jax.types import Boxes, GroundTruth, LossTerms, Predictions, Targets
 
-# Eagerly the overlap alone would compile a hundred programs.
+# Jitted, because the overlap alone compiles a hundred programs eagerly.
 total_loss = jax.jit(detection_loss, static_argnames="config")
 batch_losses = jax.jit(scene_losses, static_argnames="config")
 one_loss = jax.jit(scene_loss, static_argnames="config")
@@ -41,7 +41,7 @@ CONFIG = LossConfig()
 
 
 def random_pair(seed: int, shape: tuple[int, ...], dtype=np.float32) -> tuple[Predictions, Targets]:
-    """Predictions near enough to random targets that their boxes overlap, and all three labels."""
+    """Random targets with all three labels, and predictions whose boxes overlap theirs."""
     rng = np.random.default_rng(seed)
     label = rng.integers(-1, 2, shape).astype(np.int32)
     positive = label == 1
@@ -67,7 +67,7 @@ def some_anchors(number: int, dtype=np.float32) -> Boxes:
 
 @lru_cache
 def golden_batch(folder: Path) -> tuple[dict[str, np.ndarray], Predictions, Targets]:
-    """The file, its head outputs and its targets; direction classes stand in the files of the frames."""
+    """The golden file, its head outputs and its targets; direction classes come from the files of the frames."""
     with np.load(folder / "losses.npz") as data:
         golden = dict(data)
     label = golden["labels"].astype(np.int32)
@@ -88,7 +88,7 @@ def golden_batch(folder: Path) -> tuple[dict[str, np.ndarray], Predictions, Targ
 @pytest.mark.reference
 @pytest.mark.parametrize("name", ["all3", "first", "first2", "empty"])
 def test_golden_terms(shared, name):
-    """Of the batch in one go, and of batches of some of its scenes: means of their terms."""
+    """Terms of the whole batch, and means of the terms of some of its scenes."""
     golden, predictions, targets = golden_batch(shared / "golden")
     anchors, _ = make_anchors(car_released())
     if name == "all3":
@@ -108,7 +108,7 @@ def test_golden_terms(shared, name):
 
 @pytest.mark.reference
 def test_golden_parts(shared):
-    """Positives and negatives, and the seven residuals, apart; the overlap of the decoded boxes."""
+    """Positives and negatives apart, each of the seven residuals, and the overlap of the decoded boxes."""
     golden, predictions, targets = golden_batch(shared / "golden")
     positive = targets.label == 1
     share = 1 / positive.sum(1).clip(1) / 3
@@ -121,7 +121,7 @@ def test_golden_parts(shared):
     scene, anchor = np.nonzero(positive)
     anchors = jax.tree.map(lambda leaf: leaf[anchor], make_anchors(car_released())[0])
     overlap = find_overlap(predictions.box[scene, anchor], targets.box[scene, anchor], anchors)
-    # The file's overlaps are of boxes in float32 at their place, which moves them by 4e-6.
+    # The golden overlaps are of float32 boxes away from the origin, which changes them by up to 4e-6.
     np.testing.assert_allclose(overlap, golden["iou_pos_exact"], rtol=0, atol=6e-6)
 
 
@@ -138,7 +138,7 @@ def test_golden_gradients(shared):
     random = golden["grad_rand_batch_index"].astype(int), golden["grad_rand_anchor_index"]
     close(np.asarray(gradient.class_logit)[random], golden["grad_rand_cls"])
 
-    # 4e-6 of overlap are 7e-5 of a gradient before the division by 53 positives and 3 scenes.
+    # An overlap error of 4e-6 changes a gradient by 7e-5 before the division by 53 positives and 3 scenes.
     close(gradient.iou[positive], golden["grad_pos_iou"][:, 0], atol=5e-7)
     share = 1 / positive.sum(1).clip(1)[np.nonzero(positive)[0]] / 3
     given = jnp.asarray(golden["iou_pos_exact"])
@@ -155,7 +155,7 @@ def test_golden_gradients(shared):
 
 
 def test_focal_loss_of_the_released_code():
-    """Alpha weighs the positives; an ignored anchor costs nothing."""
+    """Alpha weights the positives; an ignored anchor has no loss."""
     loss = classification_loss(jnp.full(3, 0.5), jnp.array([1, 0, -1]), **FOCAL)
     np.testing.assert_allclose(loss, [0.01689337, 0.28305870, 0], rtol=1e-6)
 
@@ -174,14 +174,14 @@ def test_focal_loss_by_hand(alpha, gamma):
 
 
 def test_focal_gradient_by_hand():
-    """At logit 0, p = 1/2: alpha * (1 - p)**2 * (2 * p * log(p) + p - 1), and the mirror of it for a negative."""
+    """At logit 0, p = 1/2: alpha * (1 - p)**2 * (2 * p * log(p) + p - 1), and its mirror image for a negative."""
     slope = jax.grad(lambda z: classification_loss(z, jnp.array([1, 0, -1]), **FOCAL).sum())(jnp.zeros(3))
     expected = 0.25 * (np.log(0.5) - 0.5)
     np.testing.assert_allclose(slope, [0.25 * expected, -0.75 * expected, 0], rtol=1e-6)
 
 
 def test_smooth_l1_by_hand():
-    """Both sides of the joint, other sigmas, and slopes: sigma**2 * error, then the sign."""
+    """Both branches, several sigmas, and the derivative: sigma**2 * error, then the sign."""
     errors = jnp.array([0.05, 1 / 9, 0.5, -0.05, -0.5, 0.0])
     half = [0.01125, 0.0555556, 0.4444444]
     np.testing.assert_allclose(smooth_l1(errors, sigma=3.0), [*half, half[0], half[2], 0], rtol=1e-6)
@@ -196,7 +196,7 @@ def test_smooth_l1_by_hand():
 
 
 def test_box_loss_by_hand():
-    """The sine takes a box turned by pi for the same; errors of one residual stay in it."""
+    """The loss ignores a rotation by pi, and each residual affects only its own entry."""
     error = np.diag([0.05, -0.05, 0.5, 1.5, 0.0, 1 / 9, np.pi / 6]).astype(np.float32)
     target = np.linspace(-0.3, 0.3, 7, dtype=np.float32)[None].repeat(7, 0)
     expected = np.diag([0.01125, 0.01125, 0.4444444, 1.5 - 1 / 18, 0, 0.0555556, 0.5 - 1 / 18])
@@ -209,7 +209,7 @@ def test_box_loss_by_hand():
 
 
 def test_direction_loss_by_hand():
-    """log(1 + exp(other - own)); the slope is the probability less the one-hot class."""
+    """The loss is log(1 + exp(other - own)), its gradient the probabilities minus the one-hot class."""
     logits, direction = jnp.array([[0.0, 0.0], [2.0, -1.0], [2.0, -1.0], [5.0, 1.0]]), jnp.array([0, 0, 1, 1])
     positive = jnp.array([True, True, True, False])
     loss, back = jax.vjp(lambda given: direction_loss(given, direction, positive), logits)
@@ -228,7 +228,7 @@ def test_iou_loss_by_hand():
     np.testing.assert_allclose(back(jnp.ones(3))[0], [0.45, -1, 0], rtol=1e-5)
 
 
-def test_the_overlap_is_that_of_the_boxes_at_their_place():
+def test_the_overlap_does_not_depend_on_the_position_of_the_anchor():
     anchors = some_anchors(200)
     predictions, targets = random_pair(0, (200,))
     shifted = [decode(residuals, anchors) for residuals in (predictions.box, targets.box)]
@@ -241,7 +241,7 @@ def test_the_overlap_is_that_of_the_boxes_at_their_place():
 
 
 def test_terms_of_a_scene_by_hand():
-    """Sums over the anchors by their positives, and the weighted total; every weight of the config counts."""
+    """Sums over the anchors divided by the positives, and the total with every weight of the config."""
     anchors = some_anchors(60)
     predictions, targets = random_pair(1, (60,))
     config = LossConfig(
@@ -271,7 +271,7 @@ def test_terms_of_a_scene_by_hand():
 
 
 def smooth_piece(name: str, dtype) -> tuple:
-    """A piece as a function of what it differentiates, with numbers away from its joints."""
+    """A piece as a function of its differentiable argument, with a point away from its kinks."""
     predictions, targets = random_pair(2, (12,), dtype)
     positive = targets.label == 1
     return {
@@ -284,14 +284,14 @@ def smooth_piece(name: str, dtype) -> tuple:
 
 
 @pytest.mark.parametrize("name", ["classification", "smooth_l1", "box", "direction", "iou"])
-def test_gradients_are_those_of_the_values(name):
+def test_gradients_match_the_values(name):
     with jax.enable_x64(True):
         piece, at = smooth_piece(name, np.float64)
         assert piece(at).dtype == jnp.float64
         check_grads(jax.jit(piece), (at,), order=1, modes=("fwd", "rev"), atol=1e-6, rtol=1e-6)
 
 
-def test_gradients_of_the_total_are_those_of_its_values_but_for_the_overlap():
+def test_gradients_of_the_total_match_its_values_except_for_the_overlap():
     with jax.enable_x64(True):
         anchors = some_anchors(20, np.float64)
         predictions, targets = random_pair(3, (2, 20), np.float64)
@@ -310,7 +310,7 @@ def test_gradients_of_the_total_are_those_of_its_values_but_for_the_overlap():
         check_grads(jax.jit(box_only), (predictions.box,), order=1, modes=("rev",), atol=1e-6, rtol=1e-6)
 
 
-def test_the_iou_loss_leaves_the_box_alone():
+def test_the_iou_loss_has_no_gradient_in_the_box():
     anchors = some_anchors(40)
     predictions, targets = random_pair(4, (1, 40))
     gradient = jax.jit(jax.grad(lambda p: detection_loss(p, targets, anchors, CONFIG).iou))(predictions)
@@ -319,7 +319,7 @@ def test_the_iou_loss_leaves_the_box_alone():
     assert np.asarray(gradient.iou).any()
 
 
-# What no input may break
+# Robustness
 
 ANCHORS, ANCHOR_LABELS = make_anchors(tiny())
 CAR_BOX = (6.0, 0.0, -1.0, 3.9, 1.6, 1.5, 0.2)
@@ -370,7 +370,7 @@ def test_value_and_gradient_are_finite(truth, residual, logit):
     assert float(terms.total) > 0 or logit == -1e4
 
 
-def test_no_gradient_comes_from_masked_anchors_whatever_they_say():
+def test_masked_anchors_have_no_gradient_even_if_non_finite():
     anchors = some_anchors(30)
     predictions, targets = random_pair(5, (1, 30))
     positive, counts = targets.label == 1, targets.label >= 0
@@ -384,8 +384,8 @@ def test_no_gradient_comes_from_masked_anchors_whatever_they_say():
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), run(broken), run(predictions))
 
 
-def test_an_overlap_with_a_box_that_is_not_finite_is_none():
-    """exp(1e3) has no float32; exp(50) squared has none either."""
+def test_the_overlap_with_a_non_finite_box_is_zero():
+    """exp(1e3) overflows float32, and so does exp(50) squared."""
     anchors = some_anchors(1)
     for residual in (1e3, 50.0, 1e30, np.inf, np.nan):
         overlap = find_overlap(jnp.full((1, 7), residual), jnp.zeros((1, 7)), anchors)
@@ -393,7 +393,7 @@ def test_an_overlap_with_a_box_that_is_not_finite_is_none():
     assert float(find_overlap(jnp.zeros((1, 7)), jnp.zeros((1, 7)), anchors)[0]) == pytest.approx(1)
 
 
-def test_a_perfect_prediction_costs_nothing():
+def test_a_perfect_prediction_has_no_loss():
     truth = Boxes.from_array(jnp.asarray([CAR_BOX]))
     anchors = some_anchors(1)._replace(center=jnp.array([[6.0, 0.2, -1.0]]))
     residuals = encode(truth, anchors)

@@ -1,7 +1,4 @@
-"""The training step: its schedule and optimiser by hand, what it skips, and the same update on any number of devices.
-
-Several devices need a process of their own with so many forced host devices: `devices.py`.
-"""
+"""The training step: schedule and optimiser by hand, skipped updates, and the same update on any number of devices."""
 
 import json
 import subprocess
@@ -30,7 +27,7 @@ step = jax.jit(train_step, static_argnames=("config", "axis_name"))
 
 
 def short(**schedule: Any) -> Config:
-    """A training of twenty steps; most tests share the program of its defaults."""
+    """A config for twenty steps; most tests share the program of its defaults."""
     config = small_config()
     return replace(config, schedule=replace(config.schedule, **{"total_steps": 20, "ema_decay": 0.5} | schedule))
 
@@ -45,7 +42,7 @@ def fresh(config: Config) -> Any:
 
 
 def test_one_cycle_as_released():
-    """Numbers of the released schedule."""
+    """Learning rate and b1 of the released code at some steps."""
     schedule = car().schedule
     for at, rate, decay in (
         (0, 3e-4, 0.95),
@@ -71,7 +68,7 @@ def test_plain_cosine_falls_from_the_peak_to_zero():
 
 @pytest.mark.parametrize("scale", [1e-3, 100.0])
 def test_optimizer_is_clipped_adam_with_decay_first(scale):
-    """By hand in float64: clip, p (1 - rate decay), Adam whose bias correction uses the current momentum."""
+    """By hand in float64: clip, p (1 - rate decay), and Adam with the current b1 in its bias correction."""
     schedule = ScheduleConfig(total_steps=10)
     rng = np.random.default_rng(0)
     params = {"kernel": rng.normal(size=(3, 4)), "bias": rng.normal(size=4)}
@@ -115,7 +112,7 @@ def test_twenty_steps_learn_and_repeat_bit_for_bit():
     assert int(state.skipped) == 0
 
 
-def test_metrics_are_scalars_that_count_what_was_lost():
+def test_metrics_are_scalars_with_the_overflow_counts():
     config = short()
     crowded = batch()._replace(points_cut=np.array([3, 4], np.int32), boxes_cut=np.array([1, 0], np.int32))
     _, metrics = step(fresh(config), crowded, config)
@@ -128,7 +125,7 @@ def test_metrics_are_scalars_that_count_what_was_lost():
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered")
-def test_an_update_that_is_not_finite_is_left_out_and_counted():
+def test_a_non_finite_update_is_skipped_and_counted():
     config = short()
     state, _ = step(fresh(config), batch(), config)
     params = jax.tree.map(jnp.asarray, state.params)
@@ -159,7 +156,7 @@ def test_empty_scenes_stay_finite(empty):
 
 
 def test_an_epoch_of_all_sizes_is_traced_once():
-    """Frames without points, without boxes, and with more points than fit, in one program of each part."""
+    """Frames without points, without boxes, and with more points than fit share one program per part."""
     config, clouds = short(), {"many": 5000, "none": 0, "one": 1, "some": 300, "few": 40, "usual": 600}
 
     def read(name: str) -> Frame:
@@ -178,7 +175,7 @@ def test_an_epoch_of_all_sizes_is_traced_once():
     assert int(state.skipped) == 0
 
 
-def test_running_mean_of_the_parameters_serves_prediction():
+def test_prediction_uses_the_moving_average_of_the_parameters():
     config = short()
     start = fresh(config)
     state, _ = step(start, batch(), config)
@@ -190,8 +187,7 @@ def test_running_mean_of_the_parameters_serves_prediction():
     chex.assert_trees_all_equal(variables_of(plain)["params"], plain.params)
 
 
-def test_accumulated_gradients_make_one_update():
-    """That of their mean."""
+def test_accumulated_gradients_make_the_update_of_their_mean():
     rng = np.random.default_rng(0)
     params, *gradients = ({"kernel": rng.normal(size=(3, 4)).astype(np.float32)} for _ in range(3))
     twice, once = (make_optimizer(ScheduleConfig(total_steps=10, gradient_accumulation_steps=n)) for n in (2, 1))
@@ -213,7 +209,7 @@ def test_accumulated_steps_make_one_update():
     twice, metrics = step(once, batch(), config)
     assert float(metrics["learning_rate"]) == pytest.approx(3e-4)
     whole, _ = step(fresh(short()), batch(), short())
-    # Batch statistics differ between the two steps, the parameters and so the gradients of training mode do not.
+    # Both gradients are equal: batch statistics differ between the steps, but training mode does not read them.
     chex.assert_trees_all_close(twice.params, whole.params, rtol=0, atol=1e-6)
 
 
@@ -241,7 +237,7 @@ def test_bfloat16_keeps_parameters_and_statistics_in_float32():
 def test_several_devices_make_the_same_update():
     """Gradients to 1e-6 relative and parameters to 1e-5, in float64; pooled statistics and metrics too.
 
-    Measured in a process with eight devices; one test, so that it is started once.
+    `devices.py` measures all cases in one process with eight forced devices.
     """
     command = [sys.executable, str(Path(__file__).parents[1] / "devices.py")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

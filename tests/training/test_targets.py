@@ -1,4 +1,4 @@
-"""Targets against the released assigner's numbers, a plain loop, and what must hold of any scene."""
+"""Targets: the released assigner's numbers, a plain loop, and properties of any scene."""
 
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ from ciassd_jax.ops.boxes import direction_target, from_paper, nearest_aligned, 
 from ciassd_jax.training.targets import assign_targets, nearest_iou
 from ciassd_jax.types import Boxes, GroundTruth, Targets
 
-# Two classes on a grid of numbers that float32 holds exactly, so that ties are ties in any arithmetic.
+# Two classes on a grid of numbers that are exact in float32, so that ties do not depend on rounding.
 SMALL = replace(
     tiny(),
     grid=GridConfig(
@@ -40,7 +40,7 @@ def assign(truth: GroundTruth, config=SMALL) -> Targets:
 
 
 def scene(paper: np.ndarray, labels: np.ndarray | None = None, capacity: int = CAPACITY) -> GroundTruth:
-    """A padded scene from boxes (n, 7) of the paper's numbers; all of the first class where nothing is said."""
+    """A padded scene of boxes [n, 7] (x, y, z, w, l, h, r), by default of the first class."""
     paper = np.asarray(paper, np.float64).reshape(-1, 7)
     number = len(paper)
     boxes = np.zeros((capacity, 7), np.float32)
@@ -51,7 +51,7 @@ def scene(paper: np.ndarray, labels: np.ndarray | None = None, capacity: int = C
 
 
 def random_boxes(rng: np.random.Generator, number: int, labels: np.ndarray, step: float = 0.0) -> np.ndarray:
-    """Boxes near the sizes of their classes, in and beside the small range; on a lattice of `step` if it is not 0."""
+    """Boxes about the size of their class, inside and outside the small range; multiples of `step` if it is not 0."""
     size = np.array([[c.width, c.length, c.height] for c in SMALL.classes])[labels]
     boxes = np.concatenate(
         [
@@ -119,7 +119,7 @@ def test_numbers_of_the_released_code():
 
 
 def test_agrees_with_a_plain_loop():
-    """Ties, the ignored band, forced anchors and two classes; labels and matches exact."""
+    """Exact labels and matches with ties, ignored anchors, forced anchors and two classes."""
     paper_anchors = np.asarray(to_paper(ANCHORS))
     forced_ties = ignored = 0
     for seed in range(12):
@@ -150,8 +150,8 @@ def test_agrees_with_a_plain_loop():
     assert forced_ties > 3
 
 
-def test_a_forced_anchor_belongs_to_the_box_that_it_overlaps_most():
-    """A small box has its best anchor where a box of the anchor's own size lies: that one keeps the anchor."""
+def test_a_forced_anchor_is_matched_to_the_box_that_it_overlaps_most():
+    """The best anchor of a small box coincides with a larger box, and stays matched to that one."""
     anchor = np.asarray(to_paper(ANCHORS))[len(LABELS) // 2]
     small = anchor.copy()
     small[3:5] /= 4
@@ -160,14 +160,14 @@ def test_a_forced_anchor_belongs_to_the_box_that_it_overlaps_most():
     alone = jax.tree.map(np.asarray, assign(scene([small])))
     assert alone.label[len(LABELS) // 2] == 1
     assert (alone.label == 1).sum() > 1, "every anchor around the small box has the same overlap"
-    # None of them reaches the threshold.
+    # Their overlap is below the threshold.
     iou = np.where(LABELS == 0, np.asarray(nearest_iou(scene([small]).boxes, ANCHORS))[0], 0)
     assert iou.max() == pytest.approx(1 / 16)
     np.testing.assert_array_equal(alone.label == 1, iou == iou.max())
 
 
 def test_no_box_goes_without_an_anchor():
-    """At full size and in a batch, where the compiler is free to compute an overlap again in another way."""
+    """At full size and in a batch, where the compiler might recompute an overlap with different rounding."""
     x, y = np.meshgrid(np.arange(3, 67, 8.0), np.arange(-36, 36, 9.0))
     rng = np.random.default_rng(0)
     paper = np.zeros((2, 64, 7))
@@ -181,7 +181,7 @@ def test_no_box_goes_without_an_anchor():
 
 
 def test_a_class_has_its_own_anchors_and_thresholds():
-    """The same box as a car, as a pedestrian, as both and as an obstacle."""
+    """The same box as a car, as a pedestrian, as both, and with no class."""
     box = np.asarray(to_paper(ANCHORS))[2 * 4 * 17]
     as_car, as_pedestrian, obstacle = (jax.tree.map(np.asarray, assign(scene([box], [label]))) for label in (0, 1, -1))
     for targets, label in ((as_car, 0), (as_pedestrian, 1)):
@@ -248,7 +248,7 @@ def test_a_batch_is_its_scenes():
         )
 
 
-# Boxes that are no targets
+# Boxes that are not targets
 
 CAR_BOX = (4.0, 0.0, -1.0, 1.5, 4.0, 1.5, 0.3)
 
@@ -287,11 +287,11 @@ def test_a_scene_without_boxes_is_all_negative():
     assert not np.asarray(targets.box).any()
 
 
-# What `ops.boxes` says of r
+# The angle r in `ops.boxes`
 
 
 def test_r_is_wrapped_before_it_is_encoded():
-    """r in [-pi, pi), the same direction in space, and the direction class from its sign."""
+    """r is in [-pi, pi) with the same heading, and its sign is the direction class."""
     r = np.array([-9.0, -3.2, -1.0, 0.0, 1e-3, 1.0, 3.2, 9.0])
     boxes = Boxes(np.zeros((8, 3), np.float32), np.ones((8, 3), np.float32), r_to_yaw(r).astype(np.float32))
     wrapped = wrap_r(boxes)
@@ -305,7 +305,7 @@ def test_r_is_wrapped_before_it_is_encoded():
     [(0.0, False), (0.78, False), (0.79, True), (1.57, True), (2.35, True), (2.36, False), (-3.0, False)],
 )
 def test_the_nearest_axis(r, turned):
-    """The width lies along x at r = 0."""
+    """At r = 0 the width is along x."""
     low, high = nearest_aligned(from_paper(jnp.array([1.0, 2.0, 0.0, 2.0, 4.0, 1.5, r])))
     np.testing.assert_allclose(high - low, (4, 2) if turned else (2, 4), rtol=1e-6)
     np.testing.assert_allclose(high + low, (2, 4), rtol=1e-6)
