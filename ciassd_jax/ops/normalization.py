@@ -53,11 +53,11 @@ def _batch_norm(
     x: Array, real: Array | None, scale: Array, bias: Array, epsilon: float, axis_name: str | None
 ) -> tuple[Array, Array, Array, Array]:
     total, count = _pooled((_real(x, real).sum(_axes(x)), _count(x, real)), axis_name)
-    entries = jnp.maximum(count, 1)
-    mean = total / entries
+    share = 1 / jnp.maximum(count, 1)
+    mean = total * share
     # Around the mean, not from the mean square: no cancellation.
     spread = _real(_wide(x) - _row(mean, x), real)
-    variance = _pooled((spread**2).sum(_axes(x)), axis_name) / entries
+    variance = _pooled((spread**2).sum(_axes(x)), axis_name) * share
     return scale_and_shift(x, scale, bias, mean, variance, epsilon=epsilon), mean, variance, count
 
 
@@ -77,8 +77,8 @@ def _backward(epsilon: float, axis_name: str | None, saved: tuple, gradients: tu
     along = (_wide(gradient) * (_wide(x) - _row(mean, x))).sum(_axes(x))
     pooled_bias, pooled_along = _pooled((to_bias, along), axis_name)
     # All entries move mean and variance, whatever device reads them.
-    entries = jnp.maximum(count, 1)
-    drift, slope = pooled_bias / entries, pooled_along * inverse**2 / entries
+    share = 1 / jnp.maximum(count, 1)
+    drift, slope = pooled_bias * share, pooled_along * inverse**2 * share
     gradient, x, mean = lax.optimization_barrier((gradient, x, mean))
     moved = _real(_row(drift, x) + (_wide(x) - _row(mean, x)) * _row(slope, x), real)
     to_x = (_wide(gradient) - moved) * _row(scale * inverse, x)

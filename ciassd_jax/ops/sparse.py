@@ -189,13 +189,13 @@ class _Blocks:
             return array
         return array.reshape(self.scenes, self.padded, -1)[:, : self.slots].reshape(self.scenes * self.slots, -1)
 
-    def accumulate(self, step: Callable[[Array, Any], Any], start: Any) -> Any:
-        """Run step(first row, carry) for every block that holds a real row."""
+    def accumulate(self, step: Callable[[Array, Array, Any], Any], start: Any) -> Any:
+        """Run step(first row, end of the scene's real rows, carry) for every block that holds a real row."""
 
         def each_scene(scene: Array, carry: Any) -> Any:
             first = scene * self.padded
             last = first + self.count[scene]
-            block = lambda state: (state[0] + self.rows, step(*state))  # noqa: E731
+            block = lambda state: (state[0] + self.rows, step(state[0], last, state[1]))  # noqa: E731
             return lax.while_loop(lambda state: state[0] < last, block, (first, carry))[1]
 
         return lax.fori_loop(0, self.scenes, each_scene, start)
@@ -218,7 +218,7 @@ def _multiply_blocks(features: Array, index: Array, count: Array, kernel: Array)
     index, padded = blocks.pad(index, features.shape[0]), _with_zero_row(features)
     kernel = kernel.reshape(-1, out)
 
-    def multiply(start: Array, result: Array) -> Array:
+    def multiply(start: Array, end: Array, result: Array) -> Array:
         product = _product(blocks.gather(padded, index, start), kernel, features.dtype)
         return lax.dynamic_update_slice_in_dim(result, product.astype(features.dtype), start, 0)
 
@@ -231,15 +231,16 @@ def _gradients_blocks(
 ) -> tuple[Array, Array]:
     blocks, (columns, out, channels) = _Blocks(index, count), kernel.shape
     index, padded = blocks.pad(index, gradient.shape[0]), _with_zero_row(gradient)
-    features = blocks.pad(_real_rows(features, count))
+    features = blocks.pad(features)
     kernel_rows = kernel.reshape(-1, channels)
 
-    def accumulate(start: Array, results: tuple[Array, Array]) -> tuple[Array, Array]:
+    def accumulate(start: Array, end: Array, results: tuple[Array, Array]) -> tuple[Array, Array]:
         to_features, to_kernel = results
         gathered = blocks.gather(padded, index, start)
         block = _product(gathered, kernel_rows, features.dtype).astype(features.dtype)
         to_features = lax.dynamic_update_slice_in_dim(to_features, block, start, 0)
-        rows = lax.dynamic_slice_in_dim(features, start, blocks.rows)
+        real = start + jnp.arange(blocks.rows, dtype=jnp.int32)[:, None] < end
+        rows = jnp.where(real, lax.dynamic_slice_in_dim(features, start, blocks.rows), 0)
         return to_features, to_kernel + _product(rows.T, gathered, features.dtype)
 
     empty = zeros_after(blocks.count[0], features.shape, features.dtype)
