@@ -171,7 +171,7 @@ class ClassConfig:
     similar: tuple[str, ...] = ()
     # Ground-truth sampling adds objects until a scene has this number of the class; 0 adds none.
     gt_sampling_up_to: int = 0
-    # Fewest points of an object that is sampled.
+    # Objects with fewer points are not sampled.
     gt_sampling_min_points: int = 5
 
     def __post_init__(self) -> None:

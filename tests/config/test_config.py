@@ -1,4 +1,4 @@
-"""Configs: refused with a sentence, hashable, and the same after a trip through JSON."""
+"""Configs: presets, JSON, use as static arguments, and validation."""
 
 import json
 import math
@@ -305,7 +305,7 @@ def test_a_config_needs_no_static_argnames():
 
 @pytest.fixture
 def no_type_checks():
-    """As outside of the tests, where no type checker refuses a value before the config does."""
+    """Switch off the type checker of the tests, which would refuse a value before the config does."""
     before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     yield

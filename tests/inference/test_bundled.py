@@ -1,4 +1,4 @@
-"""The bundled weights do what the demo shows."""
+"""The bundled weights find cars on simulated streets."""
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ def overlaps(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_they_find_the_cars_of_streets_that_nobody_trained_on() -> None:
+def test_they_find_the_cars_of_unseen_streets() -> None:
     detector = Detector.from_pretrained("car_lite")
     dataset = open_synthetic(SEED, STREETS)
     found = wanted = invented = 0

@@ -1,4 +1,4 @@
-"""`Detector`: what goes in, what comes out, when it compiles and what it warns of."""
+"""`Detector`: inputs, results, compilation and warnings."""
 
 import re
 import warnings
@@ -27,7 +27,7 @@ def detector() -> Detector:
 
 @pytest.fixture
 def quiet() -> Iterator[None]:
-    """The small network finds more candidates than it keeps; tests that are about something else ignore that."""
+    """Ignore the warning that the small network drops candidates."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Dropped .* candidates", DroppedWarning)
         yield
@@ -63,7 +63,7 @@ def test_a_list_gives_a_list_and_neighbours_do_not_matter(detector: Detector) ->
 
 
 @pytest.mark.usefixtures("quiet")
-def test_jax_arrays_and_other_number_types_are_taken(detector: Detector) -> None:
+def test_jax_arrays_and_other_number_types_are_accepted(detector: Detector) -> None:
     expected = detector(small_cloud())
     for points in (jnp.asarray(small_cloud()), small_cloud().astype(np.float64)):
         np.testing.assert_array_equal(detector(points).boxes, expected.boxes)
@@ -135,7 +135,7 @@ def test_every_bucket_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
         boxes = Boxes(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)), jnp.zeros((1, 2)))
         stages = jnp.zeros((1, 2), jnp.int32)
         counts = Counts(cloud.count, cloud.count, none, none, none, stages, stages, none, none)
-        # Reads everything, so that no argument is optimised away.
+        # Read every argument, so that none is optimised away.
         total = cloud.points.sum() + frustum.sum() + sum(leaf.sum() for leaf in jax.tree.leaves(variables))
         return Detections(boxes, jnp.zeros((1, 2)) * total, jnp.zeros((1, 2), jnp.int32), none, counts)
 

@@ -1,4 +1,4 @@
-"""Post-processing against the released code's numbers, and what the paper's preset does otherwise."""
+"""Post-processing: the released code's numbers, and where the paper's preset differs."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -24,7 +24,7 @@ CASES = range(13)
 
 
 class Stages(NamedTuple):
-    """Everything on the way from predictions to boxes; `anchor` is the number of each candidate's anchor."""
+    """Everything between predictions and boxes; `anchor` is the index of each candidate's anchor."""
 
     candidates: Candidates
     anchor: jax.Array
@@ -58,7 +58,7 @@ def detect(
 
 
 def final(stages: Stages) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The real rows of boxes (in the paper's order), scores and labels, after a look at the padding."""
+    """Check the padding; return the real rows of boxes (in the paper's order), scores and labels."""
     count = int(stages.count)
     paper, rows = np.asarray(to_paper(stages.boxes)), np.asarray(stages.boxes.to_array())
     assert not rows[count:].any()
@@ -83,7 +83,7 @@ class Case(NamedTuple):
 
     @property
     def kept(self) -> np.ndarray:
-        """Anchors above the score threshold, in their order: what golden's candidate numbers count."""
+        """Anchors above the score threshold, in order; golden's candidate numbers index this list."""
         return np.flatnonzero(self.data["keep_score"])
 
     @property
@@ -374,7 +374,7 @@ def test_no_candidate_gives_no_box(make):
 @pytest.mark.parametrize("make", [car, car_released])
 @pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("field", ["iou", "box"])
-def test_an_anchor_that_is_no_number_spoils_no_other(make, broken, field):
+def test_a_non_finite_anchor_does_not_affect_others(make, broken, field):
     """It passes the threshold but cannot be ranked or placed: counted as dropped."""
     predictions, anchors, labels = scene([(40, 5, -1, 0.0), *three_at(20), *three_at(30)])
     sane = final(detect(predictions, anchors, labels, make()))

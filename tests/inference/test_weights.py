@@ -1,4 +1,4 @@
-"""Weights files: ours there and back, released ones in every layout, and what is refused."""
+"""Weights files: round trip, released files of every layout, and what is refused."""
 
 import json
 import re
@@ -109,7 +109,7 @@ def test_a_config_of_another_version_is_named(ours: Path, name: str, words: str)
         load_weights(edit(ours, lambda tensors: None, config=json.dumps(config)))
 
 
-# What the fields were called before, besides a copy of `grid.max_voxels` as the first stage's capacity.
+# New to old names. Earlier versions also repeated `grid.max_voxels` as the first stage's capacity.
 OLD_NAMES = {
     "gt_sampling": "paste",
     "max_gt_sampling_points": "max_paste_points",
@@ -241,7 +241,7 @@ def test_a_foreign_model_is_refused(tmp_path: Path) -> None:
         load_weights(write_pth(tmp_path / "odd.pth", {"state_dict": [1, 2]}))
 
 
-def test_each_kind_of_file_has_its_own_door(tmp_path: Path, ours: Path) -> None:
+def test_each_loader_refuses_the_other_kind_of_file(tmp_path: Path, ours: Path) -> None:
     path = released_file(tmp_path, released_state())
     with pytest.raises(InputError, match=f"`ciassd convert {path} OUT.safetensors`"):
         load_weights(path)
