@@ -1,4 +1,4 @@
-"""Anchors on the BEV map (SPEC section 6.2): one for every cell, class and angle."""
+"""Anchors on the BEV map: one for every cell, class and angle (paper section 4.1)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ciassd_jax.types import Boxes
 
 
 def make_anchors(config: Config) -> tuple[Boxes, np.ndarray]:
-    """Anchors (A) as NumPy float32 and the label (A) of the class that each serves.
+    """Return the anchors [A] as NumPy float32 and the class label [A] of each.
 
     Order: y slowest, then x, then class, then angle. Centres are computed in float64 and rounded once.
     """

@@ -1,4 +1,4 @@
-"""The multi-task head: class, box, direction and the box's own IoU (paper section 3.3, SPEC section 6)."""
+"""The multi-task head: class, box, direction and the box's own IoU (paper section 3.3)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ciassd_jax.types import Predictions
 
 
 class Branch(nn.Module):
-    """One convolution; its result is float32 whatever the compute type."""
+    """One convolution with a result of float32 or wider, whatever the compute type."""
 
     channels: int
     kernel_size: int
@@ -34,7 +34,7 @@ class Branch(nn.Module):
 
 
 class MultiTaskHead(nn.Module):
-    """Four branches on the same features, or three, flattened to one row per anchor (y, x, then anchor of the cell)."""
+    """Three or four branches on the same features; one row per anchor in the order y, x, anchor of the cell."""
 
     config: HeadConfig
     anchors_per_cell: int

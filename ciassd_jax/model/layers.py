@@ -1,4 +1,4 @@
-"""Layers of the network: BatchNorm over real entries only, convolutions with it and ReLU, sparse ones too."""
+"""Layers of the network: BatchNorm over real entries only, and convolutions followed by BatchNorm and ReLU."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOMENTUM = 0.99
 
 
 def uniform_by_fan_in(fan_in: int) -> Initializer:
-    """U(-1 / sqrt(fan_in), 1 / sqrt(fan_in)), as the released code initialises (SPEC sections 4 to 6)."""
+    """Return an initializer U(-1 / sqrt(fan_in), 1 / sqrt(fan_in)), as in the released code."""
     bound = 1 / math.sqrt(fan_in)
 
     def init(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
@@ -32,10 +32,10 @@ def uniform_by_fan_in(fan_in: int) -> Initializer:
 
 
 class MaskedBatchNorm(nn.Module):
-    """BatchNorm over the real entries of the whole batch, on all devices when `axis_name` is given.
+    """BatchNorm over the real entries of the whole batch, pooled over all devices if `axis_name` is given.
 
-    An empty device, or an empty batch, stays finite; the latter leaves the running statistics as they were. Float32
-    always.
+    Statistics are float32 or wider. An empty device or batch stays finite; an empty batch leaves the running statistics
+    unchanged.
     """
 
     axis_name: str | None = None
@@ -76,7 +76,7 @@ class SparseConvNormRelu(nn.Module):
     ) -> Float[Array, "V O"]:
         depth, height, width = self.kernel_size
         inputs = features.shape[-1]
-        # spconv 1.x misreads its fan-in as kH * kW * C * O; BatchNorm follows, so only step sizes feel it.
+        # spconv 1.x takes kH * kW * C * O for the fan-in. BatchNorm follows, so that only step sizes are affected.
         init = uniform_by_fan_in(height * width * inputs * self.channels)
         kernel = self.param("kernel", init, (depth, height, width, inputs, self.channels), jnp.float32)
         kernel = kernel.reshape(-1, inputs, self.channels).astype(self.dtype)
@@ -86,7 +86,7 @@ class SparseConvNormRelu(nn.Module):
 
 
 class ConvNormRelu(nn.Module):
-    """A 2D convolution without bias on [B, H, W, C], BatchNorm, and ReLU where asked."""
+    """A 2D convolution without bias on [B, H, W, C], BatchNorm, and ReLU if `relu`."""
 
     channels: int
     kernel_size: int
@@ -107,7 +107,7 @@ class ConvNormRelu(nn.Module):
 
 
 class UpsampleNormRelu(nn.Module):
-    """Transposed 3 x 3 convolution of stride 2 that doubles H and W, BatchNorm, ReLU (SPEC section 5)."""
+    """Transposed 3 x 3 convolution of stride 2 that doubles H and W, BatchNorm, ReLU."""
 
     channels: int
     dtype: jnp.dtype
@@ -117,7 +117,7 @@ class UpsampleNormRelu(nn.Module):
     def __call__(self, x: Float[Array, "B H W C"], *, train: bool) -> Float[Array, "B H2 W2 O"]:
         inputs = x.shape[-1]
         shape = (3, 3, inputs, self.channels)
-        # torch reads the fan-in of a transposed convolution from its outputs.
+        # torch takes the fan-in of a transposed convolution from its output channels.
         kernel = self.param("kernel", uniform_by_fan_in(9 * self.channels), shape, jnp.float32)
         x = MaskedBatchNorm(self.axis_name, name="norm")(
             upsample_2d(x.astype(self.dtype), kernel.astype(self.dtype)), train=train

@@ -1,4 +1,4 @@
-"""SSFA: Spatial-Semantic Feature Aggregation (paper section 3.2 and Figure 3, SPEC section 5), and its rivals."""
+"""SSFA, Spatial-Semantic Feature Aggregation (paper section 3.2 and Figure 3), and the baseline necks of Table 4."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SSFA(nn.Module):
 
 
 class ConvolutionStack(nn.Module):
-    """The necks of SECOND and SA-SSD, which Table 4 compares with: convolutions of one resolution in a row."""
+    """Baseline necks of Table 4, those of SECOND and SA-SSD: a stack of convolutions of one resolution."""
 
     config: NeckConfig
     dtype: jnp.dtype
@@ -70,5 +70,5 @@ class ConvolutionStack(nn.Module):
 
 
 def _spread(weight: Float[Array, "B H W 1"], channels: int) -> Float[Array, "B H W C"]:
-    """The weight in every channel. As a product, whose gradient a CPU sums eight times as fast."""
+    """Repeat the weight for every channel."""
     return jnp.matmul(weight, jnp.ones((1, channels), weight.dtype), precision=jax.lax.Precision.HIGHEST)

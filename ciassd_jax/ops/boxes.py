@@ -1,4 +1,4 @@
-"""Box arithmetic, and everything that speaks of the paper's angle r = KITTI's rotation_y = -(yaw + pi/2)."""
+"""Box arithmetic, and all that concerns the paper's angle r, KITTI's rotation_y = -(yaw + pi/2)."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from ciassd_jax.types import Array, Boxes
 
 
 def wrap_angle(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The same angle in [-pi, pi), in radians (SPEC section 10.5)."""
+    """Wrap an angle in radians to [-pi, pi)."""
     return angle - jnp.floor(angle / (2 * jnp.pi) + 0.5) * (2 * jnp.pi)
 
 
 def yaw_to_r(yaw: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Counter-clockwise yaw from +x to the paper's clockwise r; its own inverse."""
+    """Convert the counter-clockwise yaw from +x to the paper's clockwise r."""
     return -(yaw + np.pi / 2)
 
 
 def r_to_yaw(r: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The paper's r to yaw."""
+    """Convert the paper's r to yaw."""
     return -r - np.pi / 2
 
 
 def to_paper(boxes: Boxes) -> Float[Array, "*n 7"]:
-    """Boxes as the paper's (x, y, z, w, l, h, r); r as computed, not wrapped."""
+    """Convert boxes to the paper's (x, y, z, w, l, h, r); r is not wrapped."""
     length, width, height = boxes.size[..., 0], boxes.size[..., 1], boxes.size[..., 2]
     x, y, z = boxes.center[..., 0], boxes.center[..., 1], boxes.center[..., 2]
     return jnp.stack([x, y, z, width, length, height, yaw_to_r(boxes.yaw)], -1)
 
 
 def from_paper(array: Float[Array, "*n 7"]) -> Boxes:
-    """Boxes from the paper's (x, y, z, w, l, h, r)."""
+    """Convert the paper's (x, y, z, w, l, h, r) to boxes."""
     size = jnp.stack([array[..., 4], array[..., 3], array[..., 5]], -1)
     return Boxes(array[..., :3], size, r_to_yaw(array[..., 6]))
 
 
 def encode(boxes: Boxes, anchors: Boxes) -> Float[Array, "*n 7"]:
-    """Residuals of boxes on anchors in the paper's order x, y, z, w, l, h, r (SPEC section 6.3).
+    """Encode boxes as residuals on anchors in the paper's order x, y, z, w, l, h, r (paper section 3.3).
 
-    The centre is divided by the anchor's footprint diagonal and height, sizes by their logarithm's difference;
-    the angle difference is not wrapped. Sizes must be positive.
+    Offsets of the centre are divided by the diagonal of the anchor's footprint and by its height; sizes are differences
+    of logarithms; the difference of angles is not wrapped. Sizes must be positive.
     """
     length, width, height = anchors.size[..., 0], anchors.size[..., 1], anchors.size[..., 2]
     diagonal = jnp.sqrt(length**2 + width**2)
@@ -62,7 +62,7 @@ def encode(boxes: Boxes, anchors: Boxes) -> Float[Array, "*n 7"]:
 
 
 def decode(residuals: Float[Array, "*n 7"], anchors: Boxes) -> Boxes:
-    """Inverse of `encode`: no wrapping, no clamping."""
+    """Decode residuals on anchors, the inverse of `encode`, without wrapping or clamping."""
     length, width, height = anchors.size[..., 0], anchors.size[..., 1], anchors.size[..., 2]
     diagonal = jnp.sqrt(length**2 + width**2)
     step = jnp.stack([diagonal, diagonal, height], -1)
@@ -72,17 +72,17 @@ def decode(residuals: Float[Array, "*n 7"], anchors: Boxes) -> Boxes:
 
 
 def wrap_r(boxes: Boxes) -> Boxes:
-    """The same boxes with r in [-pi, pi), as truth is encoded (SPEC section 2.2, step 10)."""
+    """Wrap r to [-pi, pi), as is done with ground truth before it is encoded."""
     return boxes._replace(yaw=r_to_yaw(wrap_angle(yaw_to_r(boxes.yaw))))
 
 
 def direction_target(boxes: Boxes) -> Int[Array, "*n"]:
-    """The direction class that says of a box of wrapped r where it looks: 1 if r > 0, else 0 (SPEC section 6.4)."""
+    """Return the direction class of boxes with wrapped r: 1 if r > 0, else 0."""
     return (yaw_to_r(boxes.yaw) > 0).astype(jnp.int32)
 
 
 def nearest_aligned(boxes: Boxes) -> tuple[Float[Array, "*n 2"], Float[Array, "*n 2"]]:
-    """Lowest and highest x, y of the footprints once turned to the nearest axis (SPEC section 7.1)."""
+    """Return the lowest and highest x, y of the footprints, each turned to its nearest axis."""
     r = yaw_to_r(boxes.yaw)
     turned = jnp.abs(r - jnp.floor(r / np.pi + 0.5) * np.pi) > np.pi / 4
     length, width = boxes.size[..., 0], boxes.size[..., 1]

@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 Padding = tuple[tuple[int, int], tuple[int, int]]
 
-# Cells that a CPU multiplies at once for the gradient of a kernel, so that they stay in cache.
+# Cells that a CPU multiplies at once for the gradient of a kernel: they must stay in cache.
 _BLOCK_CELLS = 900
-# A map of no more cells is not worth the blocks, which take longer to compile.
+# Blocks of a smaller map would cost more compilation than they save.
 _FEW_CELLS = 4096
 
 
@@ -21,13 +21,13 @@ _FEW_CELLS = 4096
 def convolve_2d(
     x: Float[Array, "B H W C"], kernel: Float[Array, "Y X C O"], padding: Padding, stride: int = 1
 ) -> Float[Array, "B H2 W2 O"]:
-    """Cross-correlation with so many zeros around.
+    """Cross-correlate with explicit zero padding.
 
-    On a CPU the gradient of the kernel is a sum of blocked matrix products: XLA's own convolution takes two and a half
-    times as long.
+    On a CPU the gradient of the kernel is a sum of blocked matrix products: XLA's own convolution takes 2.5 times as
+    long.
     """
     if kernel.shape[:2] == (1, 1) and stride == 1:
-        # The same sums as a matrix product: on a CPU in less than half of the time.
+        # A matrix product of the same sums takes a CPU less than half the time.
         return jnp.matmul(x, kernel[0, 0], precision=lax.Precision.HIGHEST)
     return lax.conv_general_dilated(
         x,

@@ -1,6 +1,6 @@
-"""Overlap of rotated boxes without sorting vertices (DESIGN section 4): branch-free, for all pairs at once.
+"""Overlap of rotated boxes without sorting vertices: branch-free, for all pairs at once.
 
-Written once for jax.numpy (in the network's float type, under jit) and NumPy (the evaluator's float64).
+Written once for jax.numpy and for NumPy, which the evaluator uses in float64.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ciassd_jax.types import Array, Boxes
 
 
 def intersection_bev(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
-    """Area in square metres that the footprints of `a` and `b` share; leading axes broadcast.
+    """Return the area in square metres that the footprints of `a` and `b` share; leading axes broadcast.
 
     In the frame of `a`, its rectangle is |x| <= p, |y| <= q. The edges of both, each clipped by the other, bound
     the intersection; the sum of their cross products is twice its area. Crossings are computed once and used for
@@ -27,7 +27,7 @@ def intersection_bev(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
     dx, dy = b.center[..., 0] - a.center[..., 0], b.center[..., 1] - a.center[..., 1]
     x, y = cosine_a * dx + sine_a * dy, cosine_a * dy - sine_a * dx
     p, q = a.size[..., 0] / 2, a.size[..., 1] / 2
-    # Of the turn from a to b; products, as sines of every pair would take most of the time.
+    # Of the angle from a to b, by products: sines of every pair would take most of the time.
     cosine, sine = cosine_a * cosine_b + sine_a * sine_b, cosine_a * sine_b - sine_a * cosine_b
     u, v = b.size[..., 0] / 2, b.size[..., 1] / 2
     ux, uy, vx, vy = u * cosine, u * sine, -v * sine, v * cosine
@@ -37,7 +37,7 @@ def intersection_bev(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
         (x + ux + vx, y + uy + vy),
         (x - ux + vx, y - uy + vy),
     ]
-    # The edges of `b` as (step, 1 / step) in x and y: two of them and their opposites, so that four divisions do.
+    # The edges of `b` as (step, 1 / step) in x and y. Opposite edges differ in sign: four divisions serve all.
     along, across = [[(2 * step, _inverse(xp, 2 * step)) for step in edge] for edge in ((ux, uy), (vx, vy))]
     back, home = [[(-step, -inverse) for step, inverse in edge] for edge in (along, across)]
 
@@ -104,14 +104,14 @@ def _clip(
 
 
 def iou_bev(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
-    """Intersection over union of the rotated footprints; 0 where both are empty."""
+    """Return the intersection over union of the rotated footprints; 0 where both are empty."""
     shared = intersection_bev(a, b)
     union = a.size[..., 0] * a.size[..., 1] + b.size[..., 0] * b.size[..., 1] - shared
     return shared / union.clip(1e-7)
 
 
 def iou_3d(a: Boxes, b: Boxes) -> Float[Array, "*n"]:
-    """Intersection over union of the volumes (SPEC section 8); 0 where both are empty."""
+    """Return the intersection over union of the volumes; 0 where both are empty."""
     xp = np if isinstance(a.yaw, np.ndarray) and isinstance(b.yaw, np.ndarray) else jnp
     top = xp.minimum(a.center[..., 2] + a.size[..., 2] / 2, b.center[..., 2] + b.size[..., 2] / 2)
     bottom = xp.maximum(a.center[..., 2] - a.size[..., 2] / 2, b.center[..., 2] - b.size[..., 2] / 2)

@@ -21,7 +21,7 @@ _BLOCK_ROWS = 64
 
 
 class Clusters(NamedTuple):
-    """One box for each candidate that was selected (`selected`); the other rows mean nothing."""
+    """One box for each candidate; rows that are not `selected` are undefined."""
 
     boxes: Boxes
     score: Float[Array, " K"]
@@ -32,7 +32,7 @@ class Clusters(NamedTuple):
 def pairwise_iou(boxes: Boxes, count: Int[Array, ""]) -> Float[Array, "K K"]:
     """Rotated BEV IoU of the first `count` boxes with each other, zero elsewhere.
 
-    Computed in blocks of rows, so that padding costs nothing; scene after scene, each with as many as it needs.
+    Computed in blocks of rows, scene after scene, so that padding costs nothing.
     """
     capacity = boxes.yaw.shape[0]
     rows = min(_BLOCK_ROWS, capacity)
@@ -88,12 +88,12 @@ def released_di_nms(
     sigma_squared: tuple[float, ...],
     distances: tuple[float, ...],
 ) -> Clusters:
-    """DI-NMS as the released code has it (SPEC section 10.2).
+    """DI-NMS as in the released code.
 
-    Support counts all candidates of any overlap, so that it is known before any is selected; one without enough
-    support never suppresses. Each kept box averages all candidates of overlap above the limit, raw yaw included.
-    The softmax of squared anchor distances refines the reported score only. Selected boxes beyond the last
-    distance have no weight at all: they are not selected.
+    Support counts all candidates that overlap at all, so that it is known before any is selected. A candidate without
+    enough support never suppresses another. Each kept box averages all candidates that overlap it by more than the
+    limit, raw yaw included. The softmax of squared anchor distances refines the reported score only. Boxes beyond the
+    last distance have no weight and are not selected.
     """
     iou, real = _class_overlap(candidates)
     support = jnp.where(iou > 0, iou * candidates.iou[None], 0).sum(1)
@@ -115,7 +115,7 @@ def paper_di_nms(
     sigma_squared: tuple[float, ...],
     distances: tuple[float, ...],
 ) -> Clusters:
-    """DI-NMS as the paper has it (Algorithm 1).
+    """DI-NMS of the paper (Algorithm 1).
 
     Candidates must come in order of their score, which is reported too. A suppressed box belongs to the first
     kept box that overlaps it; support and average run over those. A cluster without enough support is removed.
@@ -137,7 +137,7 @@ def paper_di_nms(
 
 
 def refine_by_anchor_distance(candidates: Candidates) -> Candidates:
-    """Lower the score of boxes far from their anchor and sort by it (Algorithm 1, line 2; SPEC section 10.2).
+    """Lower the score of boxes far from their anchor and sort by it (Algorithm 1, line 2).
 
     S = f * (1 - softmax(distance)) over the candidates of the scene, distance in metres.
     """
@@ -178,7 +178,7 @@ def _average(boxes: Boxes, weights: Float[Array, "K K"], *, align: bool) -> Boxe
     usable = total != 0
     share = weights / jnp.where(usable, total, 1)[:, None]
     own = boxes.to_array()
-    # A box of an infinite size overlaps nothing, but its zero weight times infinity would be no number.
+    # A box of infinite size overlaps nothing, but zero weight times infinity would be NaN.
     finite = jnp.where(jnp.isfinite(own), own, 0)
     mean = jnp.matmul(share, finite, precision=lax.Precision.HIGHEST)
     if align:

@@ -35,15 +35,15 @@ def batch_norm(
     epsilon: float,
     axis_name: str | None = None,
 ) -> tuple[Float[Array, "*n C"], Float[Array, " C"], Float[Array, " C"], Float[Array, ""]]:
-    """x normalised by the mean and the biased variance of its real entries; both, and the number of those entries.
+    """Normalise x by the mean and the biased variance of its real entries. Returns (y, mean, variance, count).
 
-    With `axis_name` sums and counts are pooled over that axis before they are divided, so that unequal devices weigh as
-    their entries do. Without any entry mean and variance are 0. What else is in x is scaled and shifted likewise. Only
-    the first result has a gradient: two sums and one more pass over x, where differentiation step by step takes twice
-    as many.
+    With `axis_name`, sums and counts are pooled over that axis before the division, so that every entry weighs the same
+    on whatever device it is. Without any entry, mean and variance are 0. Entries that are not real are scaled and
+    shifted too. Only y has a gradient: two sums and one more pass over x, half of what differentiation step by step
+    takes.
     """
     if axis_name is not None:
-        # Each device has its own gradient of them, which the types of shard_map must know.
+        # Each device has its own gradient of them; the types of shard_map must show it.
         scale, bias = (values + 0 * lax.axis_index(axis_name) for values in (scale, bias))
     return _batch_norm(x, real, scale, bias, epsilon, axis_name)
 
@@ -55,7 +55,7 @@ def _batch_norm(
     total, count = _pooled((_real(x, real).sum(_axes(x)), _count(x, real)), axis_name)
     share = 1 / jnp.maximum(count, 1)
     mean = total * share
-    # Around the mean, not from the mean square: no cancellation.
+    # Around the mean rather than from the mean square: no cancellation.
     spread = _real(_wide(x) - _row(mean, x), real)
     variance = _pooled((spread**2).sum(_axes(x)), axis_name) * share
     return scale_and_shift(x, scale, bias, mean, variance, epsilon=epsilon), mean, variance, count
@@ -69,14 +69,14 @@ def _forward(x: Array, real: Array | None, scale: Array, bias: Array, epsilon: f
 def _backward(epsilon: float, axis_name: str | None, saved: tuple, gradients: tuple):  # type: ignore[no-untyped-def]
     x, real, scale, mean, variance, count = saved
     inverse = lax.rsqrt(variance + epsilon)
-    # Passes over x are cheap and maps of its size are not: without the barriers XLA would keep x - mean from the
-    # forward pass, and the gradient behind a ReLU from one pass to the next.
+    # Passes over x are cheap, copies of it are not. Without the barriers XLA would keep x - mean from the forward pass,
+    # and the gradient behind a ReLU from one pass to the next.
     x, mean = lax.optimization_barrier((x, mean))
     gradient = gradients[0]
     to_bias = _wide(gradient).sum(_axes(x))
     along = (_wide(gradient) * (_wide(x) - _row(mean, x))).sum(_axes(x))
     pooled_bias, pooled_along = _pooled((to_bias, along), axis_name)
-    # All entries move mean and variance, whatever device reads them.
+    # Mean and variance depend on the entries of all devices.
     share = 1 / jnp.maximum(count, 1)
     drift, slope = pooled_bias * share, pooled_along * inverse**2 * share
     gradient, x, mean = lax.optimization_barrier((gradient, x, mean))

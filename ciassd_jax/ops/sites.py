@@ -1,8 +1,8 @@
-"""Active sites of a scene's grid: listed by key, and found again through a map of its BEV columns.
+"""Active sites of a scene's grid, listed by key and indexed by a map of BEV columns.
 
-The map holds a mask of bits for each column (y, x), a bit for each active z, and the slot of its lowest site. A site's
-slot is that plus the number of set bits below it: constant time. The active set of a strided convolution is the OR of
-the masks in its window, and the list of its sites is read off the new map: nothing is sorted.
+For each column (y, x) the map holds a bit mask of the active z and the slot of the lowest site. The slot of a site is
+that slot plus the number of set bits below it, found in constant time. The active set of a strided convolution is the
+OR of the masks in its window, and its sites are listed from the new map: nothing is sorted.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ def strided_sites(
     padding: Triple,
     capacity: int,
 ) -> tuple[Sites, Int[Array, ""]]:
-    """Sites of a strided convolution: every output whose window holds an active input.
+    """Return the sites of a strided convolution, every output whose window holds an active input, and the overflow.
 
-    `shape` and `out_shape` are the grids (z, y, x) before and after. Over capacity the sites of lowest key
-    stay; the second result counts the others.
+    `shape` and `out_shape` are the grids (z, y, x) before and after. Over capacity, the sites of lowest key are kept
+    and the others counted.
     """
     assert sites.columns is not None, "sites of the dense backend have no map"
     masks = jnp.asarray(sites.columns)[:, :-1].reshape(*shape[1:], -1)
@@ -142,13 +142,13 @@ def _list_sites(bits: UInt32[Array, "columns W"], *, depth: int, capacity: int) 
     start = jnp.cumsum(number, dtype=jnp.int32) - number
     found = start[-1] + number[-1]
     column = jnp.arange(bits.shape[0], dtype=jnp.int32)
-    # A column marks the slot of its lowest site; the slots of its other sites follow.
+    # A column marks the slot of its lowest site; its other sites follow.
     place = jnp.where((number > 0) & (start < capacity), start, capacity + column)
     first = jnp.zeros(capacity, jnp.int32).at[place].set(column, mode="drop", unique_indices=True)
     # The largest column so far; a column has at most `depth` sites, so that it is among the last `depth` slots.
     column_of = lax.reduce_window(first, np.int32(0), lax.max, (depth,), (1,), ((depth - 1, 0),))
     slot = jnp.arange(capacity, dtype=jnp.int32)
-    # Known once: without the barrier it is fused into every neighbour table and computed again for each entry.
+    # Without the barrier it may be fused into the neighbour tables and computed again for each of their entries.
     z = lax.optimization_barrier(_nth_bit(bits[column_of], slot - start[column_of]))
     real = slot < found
     keys = jnp.where(real, column_of * depth + z, NO_SITE)
@@ -190,9 +190,9 @@ def _bits_of(z: Int[Array, " V"], words: int) -> UInt32[Array, "V W"]:
 def slots_at(
     sites: Sites, z: Int[Array, "V KZ"], y: Int[Array, "V KY"], x: Int[Array, "V KX"], *, shape: Triple
 ) -> Int[Array, "V K"]:
-    """Slots of the sites at all combinations of z, y and x of a row, in C order; the number of slots for none.
+    """Return the slots of the sites at all combinations of z, y and x of a row, in C order.
 
-    A coordinate outside of the grid `shape` (z, y, x) finds none.
+    The number of slots stands for "no site", also outside of the grid `shape` (z, y, x).
     """
     depth, height, width = shape
     slots = sites.keys.shape[0]
@@ -219,10 +219,10 @@ def _within(index: Int[Array, "*n"], size: int) -> Bool[Array, "*n"]:
 
 
 def to_dense(features: Float[Array, "V C"], sites: Sites, *, shape: Triple) -> Float[Array, "Z Y X C"]:
-    """The sites' features on the whole grid (z, y, x), zero where no site is active."""
+    """Scatter the sites' features to the whole grid (z, y, x), zero where no site is active."""
     depth, height, width = shape
     cells = depth * height * width
-    # Padding writes outside of the grid, each slot to a place of its own, and is dropped there.
+    # Padding slots write to distinct places out of bounds and are dropped.
     place = jnp.where(sites.keys == NO_SITE, cells + jnp.arange(sites.keys.shape[0], dtype=jnp.int32), sites.keys)
     flat = zeros_after(sites.count, (cells, features.shape[-1]), features.dtype)
     flat = flat.at[place].set(features, mode="drop", unique_indices=True, indices_are_sorted=True)
@@ -230,8 +230,8 @@ def to_dense(features: Float[Array, "V C"], sites: Sites, *, shape: Triple) -> F
 
 
 def zeros_after(count: Int[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
-    """Zeros that cannot be allocated before `count`, which is not negative, is known.
+    """Return zeros that cannot be allocated before `count`, which is not negative, is known.
 
-    Plain zeros depend on nothing: XLA sets those of all layers aside at the start, and memory doubles.
+    Plain zeros depend on nothing: XLA would allocate those of all layers at the start, and memory would double.
     """
     return jnp.broadcast_to(jnp.minimum(count, 0).astype(dtype), shape)

@@ -1,6 +1,6 @@
-"""Sparse 3D convolution by its definition: a dense grid and a mask (DESIGN section 3).
+"""Sparse 3D convolution by its definition: a dense grid and a mask.
 
-What `sites.py` and `sparse.py` compute, on whole grids. They are the oracle of the tests and serve small grids.
+The oracle of `sites.py` and `sparse.py`, and a backend for small grids.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def strided_sites(
     padding: Triple,
     capacity: int,
 ) -> tuple[Sites, Int[Array, ""]]:
-    """Sites of a strided convolution: where the kernel-sized maximum of the input's mask is set."""
+    """Return the sites of a strided convolution, every output whose window holds an active input, and the overflow."""
     mask = to_dense((sites.keys != NO_SITE).astype(jnp.float32)[:, None], sites, shape=shape)[..., 0]
     pads = [(p, p) for p in padding]
     active = lax.reduce_window(mask, 0.0, lax.max, kernel, stride, pads) > 0

@@ -1,4 +1,4 @@
-"""Voxelisation with fixed capacity (SPEC section 3): points in, mean of the first points of each voxel out."""
+"""Voxelisation with fixed capacity (paper section 4.1): the mean of the first points of each voxel."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def voxel_coordinates(
 ) -> tuple[Int[Array, "P 3"], Bool[Array, " P"]]:
     """Voxel (z, y, x) of each point and whether it lies in the grid of `cells` (x, y, z).
 
-    Exactly floor((p - minimum) / size) in float32. KITTI's coordinates are whole millimetres and often sit on a
-    cell border, where a multiplication by the reciprocal would move them to a neighbour.
+    Exactly floor((p - minimum) / size) in float32. KITTI's coordinates are whole millimetres and often lie on a cell
+    border, where a multiplication by the reciprocal would move them to the neighbouring cell.
     """
     offset = points.astype(jnp.float32) - jnp.array(minimum, jnp.float32)[None]
     index = jnp.stack([_floor_of_quotient(offset[:, axis], size) for axis, size in enumerate(voxel_size)], -1)
@@ -30,15 +30,15 @@ def voxel_coordinates(
 
 
 def _floor_of_quotient(values: Float[Array, " P"], divisor: float) -> Float[Array, " P"]:
-    """floor(values / divisor) of the division that IEEE 754 defines, for results of 0 to 2**16; else negative or above.
+    """Return floor(values / divisor) of IEEE 754 division, exact for results of 0 to 2**16.
 
-    Compilers divide by a constant, or by a vector that they broadcast, as a product with its reciprocal, and
-    accelerators may approximate. Here their quotient only names the nearest whole number n; whether it is reached, with
-    values / divisor rounded to nearest, follows from n * divisor - values, of which every step is exact.
+    Compilers replace a division by a constant with a product, and accelerators approximate it. Here the quotient only
+    proposes the nearest whole number n. Whether the rounded quotient reaches n is decided by n * divisor - values,
+    every step of which is exact.
     """
     size = np.float32(divisor)
     nearest = jnp.round(values / size)
-    # Half the distance from n to the float below: a quotient that lacks no more is rounded up to n.
+    # Half the distance from n to the float below: a quotient this close is rounded up to n.
     slack = (nearest - jnp.nextafter(nearest, jnp.zeros_like(nearest))) / 2 * size
     missing, rest = -values, size
     for _ in range(3):
@@ -63,9 +63,10 @@ def voxelize(
 ) -> SparseVoxels:
     """Group points into voxels and average the first `max_points` of each, in the order of the cloud.
 
-    Points outside the grid of `cells` (x, y, z) do not count, nor do those that are not finite. Beyond `max_voxels` the
-    voxels that the cloud touches first stay; "stop" also ignores every point after the one that met the limit
-    (the released code). `shape` (z, y, x) defines the linear keys and may have more layers than `cells`.
+    Points outside the grid of `cells` (x, y, z) and points that are not finite are ignored. Over capacity, the
+    `max_voxels` voxels that the cloud touches first are kept; "stop" also ignores every point after the one that
+    exceeds the capacity, as the released code does. `shape` (z, y, x) defines the linear keys and may have more layers
+    than `cells`.
     """
     capacity = cloud.points.shape[0]
     slots = jnp.arange(capacity, dtype=jnp.int32)
@@ -85,7 +86,7 @@ def voxelize(
     rank = jnp.cumsum(kept, dtype=jnp.int32)
     count = rank[-1]
     real = jnp.arange(max_voxels, dtype=jnp.int32) < count
-    # Where each kept voxel begins in the sorted list; each other slot writes to a place of its own that is dropped.
+    # Where each kept voxel begins in the sorted list. Every other slot writes to a distinct place out of bounds.
     place = jnp.where(kept, rank - 1, max_voxels + slots)
     start = jnp.zeros(max_voxels, jnp.int32).at[place].set(slots, mode="drop", unique_indices=True)
     # Slots of the voxel's first points in the sorted list: they share its key.
@@ -98,7 +99,7 @@ def voxelize(
     values = jnp.where(used[..., None], cloud.points[order[member]], 0)
     total = jnp.broadcast_to(jnp.maximum(num_points, 1).astype(values.dtype)[:, None], values[:, 0].shape)
     in_range = inside.sum(dtype=jnp.int32)
-    # The voxel kept last before a point in the list is the point's own, or the point's was dropped.
+    # A point's voxel was kept if the last kept voxel that begins at or before it has its key.
     in_kept = (keys != NO_SITE) & (count > 0) & (keys == keys[start][jnp.maximum(rank - 1, 0)])
     if overflow == "stop":
         in_kept &= order < limit

@@ -1,0 +1,99 @@
+"""The two backends of the sparse convolutions: "gather" computes active sites only, "dense" is the definition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from ciassd_jax.ops import sites as site_ops
+from ciassd_jax.ops import sparse, sparse_dense
+from ciassd_jax.ops.sites import Triple
+from ciassd_jax.types import Sites
+
+# (features [B * U, C], kernel [K, C, O]) to features [B * V, O], scene after scene.
+Convolution = Callable[[Array, Array], Array]
+
+
+class Window(NamedTuple):
+    """A convolution from the grid `shape` to the grid `out_shape`, both (z, y, x)."""
+
+    shape: Triple
+    out_shape: Triple
+    kernel: Triple
+    stride: Triple
+    padding: Triple
+
+
+class Backend(NamedTuple):
+    """A pair of functions of the sites of a batch of scenes.
+
+    `submanifold(sites, shape)` gives the 3 x 3 x 3 convolution whose output sites are its input sites.
+    `strided(sites, window, capacity)` gives the output sites, the convolution onto them, and the number of sites over
+    capacity of each scene.
+    """
+
+    submanifold: Callable[[Sites, Triple], Convolution]
+    strided: Callable[[Sites, Window, int], tuple[Sites, Convolution, Int[Array, " B"]]]
+
+
+def _gather_submanifold(sites: Sites, shape: Triple) -> Convolution:
+    return _through(jax.vmap(partial(sparse.submanifold_table, shape=shape))(sites))
+
+
+def _gather_strided(sites: Sites, window: Window, capacity: int) -> tuple[Sites, Convolution, Int[Array, " B"]]:
+    geometry: dict[str, Any] = window._asdict()
+    out_sites, dropped = jax.vmap(partial(site_ops.strided_sites, capacity=capacity, **geometry))(sites)
+    tables = jax.vmap(partial(sparse.strided_table, **geometry))(sites, out_sites)
+    return out_sites, _through(tables), jnp.asarray(dropped)
+
+
+def _through(tables: sparse.NeighbourTable) -> Convolution:
+    """The convolution through the tables of a batch."""
+    table = sparse.flatten_scenes(tables)
+    return lambda features, kernel: jnp.asarray(sparse.convolve(features, table, kernel))
+
+
+def _dense_submanifold(sites: Sites, shape: Triple) -> Convolution:
+    return _on_grids(sites, sites, Window(shape, shape, (3, 3, 3), (1, 1, 1), (1, 1, 1)))
+
+
+def _dense_strided(sites: Sites, window: Window, capacity: int) -> tuple[Sites, Convolution, Int[Array, " B"]]:
+    geometry: dict[str, Any] = window._asdict()
+    out_sites, dropped = jax.vmap(partial(sparse_dense.strided_sites, capacity=capacity, **geometry))(sites)
+    return out_sites, _on_grids(sites, out_sites, window), jnp.asarray(dropped)
+
+
+def _on_grids(sites: Sites, out_sites: Sites, window: Window) -> Convolution:
+    """The convolution of each scene's dense grid."""
+
+    def convolution(features: Array, kernel: Array) -> Array:
+        def one(features: Array, sites: Sites, out_sites: Sites) -> Array:
+            return jnp.asarray(
+                sparse_dense.convolve(
+                    features,
+                    sites,
+                    out_sites,
+                    kernel,
+                    shape=window.shape,
+                    out_shape=window.out_shape,
+                    kernel_size=window.kernel,
+                    stride=window.stride,
+                    padding=window.padding,
+                )
+            )
+
+        scenes = features.reshape(*sites.keys.shape, -1)
+        return jax.vmap(one)(scenes, sites, out_sites).reshape(-1, kernel.shape[-1])
+
+    return convolution
+
+
+BACKENDS = {
+    "gather": Backend(_gather_submanifold, _gather_strided),
+    "dense": Backend(_dense_submanifold, _dense_strided),
+}
