@@ -30,15 +30,16 @@ import table6_runtime
 from experiment_report import Report, check_results, facts_of_run, to_markdown, write_report
 from study import Study
 
-from ciassd_jax import Config, load_weights, open_dataset
+from ciassd_jax import Config, open_dataset
 from ciassd_jax.__main__ import keep_programs
 from ciassd_jax.cli.messages import warnings_as_lines
+from ciassd_jax.cli.options import load_as
 from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.data.folders import find_root
 from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.writing import check_folder
-from ciassd_jax.inference.weights import Weights, check_fits, find_weights
+from ciassd_jax.inference.weights import Weights
 from ciassd_jax.training.loop import TrainingError
 
 
@@ -80,10 +81,8 @@ def run(options: argparse.Namespace, command: str) -> None:
     if options.weights is not None and not experiment.takes_weights:
         raise InputError(f"{options.name} trains the networks that it compares; remove --weights.")
     data = find_root(options.data) if experiment.takes_data else None
-    weights = None if options.weights is None else load_weights(find_weights(options.weights))
+    weights = None if options.weights is None else load_as(options.weights, options.preset)
     config = config_of(options, weights)
-    if weights is not None:
-        check_fits(weights, config, options.weights)
     settings = settings_of(config, options, data)
     check_folder(options.out)
     check_results(options.out, options.name, settings)
@@ -97,8 +96,8 @@ def run(options: argparse.Namespace, command: str) -> None:
 
 
 def config_of(options: argparse.Namespace, weights: Weights | None) -> Config:
-    """Return the preset, or the config of the weights, with the schedule of the options."""
-    config = weights.config if weights and not options.preset else PRESETS[options.preset or "car_lite"]()
+    """Return the config of the weights, or the preset, with the schedule of the options."""
+    config = weights.config if weights else PRESETS[options.preset or "car_lite"]()
     changes = {"total_steps": options.budget, "batch_size": options.batch_size, "learning_rate": options.learning_rate}
     given = {name: value for name, value in changes.items() if value is not None}
     return replace(config, schedule=replace(config.schedule, **given))
