@@ -113,6 +113,7 @@ class Checkpoints:
                 progress = self._read(step, progress=ocp.args.JsonRestore())["progress"]
                 _check_format(progress, self.folder / str(step))
                 _check_config(progress["config"], self._config, self.folder / str(step))
+                _check_arrays(self.folder / str(step) / "state")
                 state = self._read(step, state=ocp.args.StandardRestore(_abstract(like)))["state"]
             except InputError:
                 raise
@@ -180,6 +181,18 @@ def _reason(error: Exception) -> str:
     if code is not None:
         return os.strerror(code)
     return next((line[:200] for line in str(error).splitlines() if line.strip()), type(error).__name__)
+
+
+def _check_arrays(folder: Path) -> None:
+    """Read every stored value, one at a time.
+
+    Orbax reads them concurrently; if one fails, it prints a traceback for each that is still pending.
+    """
+    import tensorstore
+
+    store = tensorstore.KvStore.open({"driver": "ocdbt", "base": f"{folder.as_uri()}/"}).result()
+    for key in store.list().result():
+        store.read(key).result()
 
 
 def _abstract(state: TrainState) -> TrainState:
