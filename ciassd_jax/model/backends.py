@@ -10,13 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from ciassd_jax.model.layers import Convolution
 from ciassd_jax.ops import sites as site_ops
 from ciassd_jax.ops import sparse, sparse_dense
 from ciassd_jax.ops.sites import Triple
 from ciassd_jax.types import Sites
-
-# (features [B * U, C], kernel [K, C, O]) to features [B * V, O], scene after scene.
-Convolution = Callable[[Array, Array], Array]
 
 
 class Window(NamedTuple):
@@ -47,8 +45,8 @@ def _gather_submanifold(sites: Sites, shape: Triple) -> Convolution:
 
 def _gather_strided(sites: Sites, window: Window, capacity: int) -> tuple[Sites, Convolution, Int[Array, " B"]]:
     geometry: dict[str, Any] = window._asdict()
-    out_sites, dropped = jax.vmap(partial(site_ops.strided_sites, capacity=capacity, **geometry))(sites)
-    tables = jax.vmap(partial(sparse.strided_table, **geometry))(sites, out_sites)
+    out_sites, dropped = jax.vmap(lambda one: site_ops.strided_sites(one, capacity=capacity, **geometry))(sites)
+    tables = jax.vmap(lambda one, out: sparse.strided_table(one, out, **geometry))(sites, out_sites)
     return out_sites, _through(tables), jnp.asarray(dropped)
 
 
@@ -64,7 +62,7 @@ def _dense_submanifold(sites: Sites, shape: Triple) -> Convolution:
 
 def _dense_strided(sites: Sites, window: Window, capacity: int) -> tuple[Sites, Convolution, Int[Array, " B"]]:
     geometry: dict[str, Any] = window._asdict()
-    out_sites, dropped = jax.vmap(partial(sparse_dense.strided_sites, capacity=capacity, **geometry))(sites)
+    out_sites, dropped = jax.vmap(lambda one: sparse_dense.strided_sites(one, capacity=capacity, **geometry))(sites)
     return out_sites, _on_grids(sites, out_sites, window), jnp.asarray(dropped)
 
 

@@ -15,7 +15,8 @@ from ciassd_jax.ops.convolution import convolve_2d, upsample_2d
 from ciassd_jax.ops.normalization import batch_norm, scale_and_shift
 
 Initializer = Callable[..., Array]
-Convolution = Callable[..., Any]
+# A sparse convolution: (features [B * U, C], kernel [K, C, O]) to features [B * V, O], scene after scene.
+Convolution = Callable[[Array, Array], Array]
 
 EPSILON = 1e-3
 MOMENTUM = 0.99
