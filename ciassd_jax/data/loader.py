@@ -14,7 +14,7 @@ import zlib
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from multiprocessing.util import Finalize
 from typing import Any, NamedTuple
 
@@ -150,7 +150,7 @@ def _begin_worker(index: int, count: int) -> None:
     threading.Thread(target=leave, args=(multiprocessing.parent_process(),), daemon=True).start()
 
 
-@partial(jax.jit, static_argnames="config")
+@jax.jit
 def finish_scenes(host: HostScene, seed: Int[Array, ""], config: Config) -> Scene:
     """Run the device's part: augment a batch, or without objects only drop boxes that are not targets."""
     minimum, maximum = config.grid.minimum, config.grid.maximum
