@@ -8,7 +8,6 @@ from dataclasses import FrozenInstanceError, asdict, replace
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import pytest
 
 from ciassd_jax.config import (
@@ -301,15 +300,6 @@ def test_a_config_needs_no_static_argnames():
 
 
 # Validation
-
-
-@pytest.fixture
-def no_type_checks():
-    """Switch off the type checker of the tests, which would refuse a value before the config does."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 @pytest.mark.parametrize(

@@ -124,6 +124,7 @@ def test_boxes_that_are_not_finite_are_left_out_with_a_note() -> None:
 @pytest.mark.parametrize(
     "change", [{"scores": np.ones(3)}, {"labels": ("Car",)}, {"truth_labels": ("Car", "Van")}], ids=str
 )
+@pytest.mark.usefixtures("no_type_checks")
 def test_boxes_scores_and_labels_must_belong_together(change: dict) -> None:
     with pytest.raises(ValueError, match=r"000010: .* give"):
         view_html([FRAME._replace(**change)])
