@@ -6,12 +6,13 @@ import re
 from collections.abc import Sequence
 
 from ciassd_jax.cli.messages import UsageError
-from ciassd_jax.config.json import RENAMED
 
-# By command: old option to new option. Options that replace fields of a config were renamed with the fields.
+# By command: old option to new option.
 _OPTIONS = {
     "train": {
-        f"--{old.replace('_', '-')}": f"--{new.replace('_', '-')}" for old, new in RENAMED["ScheduleConfig"].items()
+        "--accumulate": "--gradient-accumulation-steps",
+        "--rematerialize": "--remat",
+        "--no-rematerialize": "--no-remat",
     },
     "view": {"--most": "--frames"},
 }

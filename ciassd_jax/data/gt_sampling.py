@@ -152,7 +152,9 @@ def _map_database(path: Path, fingerprint: str) -> ObjectDatabase:
     if footer is None:
         raise InputError(f"{path} is damaged or cut short; {_REMEDY}.")
     if footer["fingerprint"] != fingerprint:
-        raise InputError(f"{path} is stale: frames, labels or clouds have changed since it was built; {_REMEDY}.")
+        raise InputError(
+            f"{path} is stale or of another split: its frames, labels or clouds differ from the data set's; {_REMEDY}."
+        )
     objects = np.fromfile(path, _OBJECT, footer["objects"], offset=len(_MAGIC) + footer["points"] * _POINT.itemsize)
     shape = (footer["points"], 4)
     # An empty array cannot be mapped.
