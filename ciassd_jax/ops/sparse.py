@@ -99,7 +99,7 @@ def convolve(
 
 def _multiply_on_platform(features: Array, table: NeighbourTable, kernel: Array) -> jax.Array:
     operands = (features, table.inputs, table.num_outputs, kernel)
-    return jnp.asarray(lax.platform_dependent(*operands, cpu=_multiply_blocks, default=_multiply))
+    return jnp.asarray(lax.platform_dependent(*operands, cpu=multiply_in_blocks, default=multiply_at_once))
 
 
 def _convolve_forward(
@@ -114,7 +114,13 @@ def _convolve_backward(
     features, table, kernel = saved
     transposed = jnp.swapaxes(kernel, 1, 2)
     to_features, to_kernel = lax.platform_dependent(
-        gradient, table.outputs, table.num_inputs, transposed, features, cpu=_gradients_blocks, default=_gradients
+        gradient,
+        table.outputs,
+        table.num_inputs,
+        transposed,
+        features,
+        cpu=gradients_in_blocks,
+        default=gradients_at_once,
     )
     no_gradient = NeighbourTable(*(np.zeros(t.shape, jax.dtypes.float0) for t in table))
     return to_features, no_gradient, to_kernel
@@ -143,12 +149,14 @@ def _real_rows(values: Array, count: Int[Array, "*b"]) -> Array:
 # All rows at once, for accelerators.
 
 
-def _multiply(features: Array, index: Array, count: Array, kernel: Array) -> Array:
+def multiply_at_once(features: Array, index: Array, count: Array, kernel: Array) -> Array:
     gathered = _with_zero_row(features).at[index].get(mode="promise_in_bounds").reshape(index.shape[0], -1)
     return _product(gathered, kernel.reshape(-1, kernel.shape[-1]), features.dtype).astype(features.dtype)
 
 
-def _gradients(gradient: Array, index: Array, count: Array, kernel: Array, features: Array) -> tuple[Array, Array]:
+def gradients_at_once(
+    gradient: Array, index: Array, count: Array, kernel: Array, features: Array
+) -> tuple[Array, Array]:
     """Gradients of features and kernel [K, C, O] from the output's, of which one gather serves both.
 
     `index` [U, K] lists the outputs that read a feature row, and `kernel` is [K, O, C].
@@ -213,7 +221,7 @@ class _Blocks:
         return whole.reshape(self.rows, -1)
 
 
-def _multiply_blocks(features: Array, index: Array, count: Array, kernel: Array) -> Array:
+def multiply_in_blocks(features: Array, index: Array, count: Array, kernel: Array) -> Array:
     blocks, out = _Blocks(index, count), kernel.shape[-1]
     index, padded = blocks.pad(index, features.shape[0]), _with_zero_row(features)
     kernel = kernel.reshape(-1, out)
@@ -226,7 +234,7 @@ def _multiply_blocks(features: Array, index: Array, count: Array, kernel: Array)
     return blocks.crop(blocks.accumulate(multiply, empty))
 
 
-def _gradients_blocks(
+def gradients_in_blocks(
     gradient: Array, index: Array, count: Array, kernel: Array, features: Array
 ) -> tuple[Array, Array]:
     blocks, (columns, out, channels) = _Blocks(index, count), kernel.shape

@@ -436,3 +436,22 @@ def test_to_dense_puts_each_site_in_its_place():
     expected = np.zeros((*shape, features.shape[1]), np.float32)
     expected[tuple(coordinates.T)] = features[:number]
     np.testing.assert_array_equal(grid, expected)
+
+
+def test_the_accelerators_form_equals_the_cpus():
+    """All rows at once, and block after block of the real rows; padding rows of features may be NaN."""
+    rng = np.random.default_rng(0)
+    scenes, slots, offsets, counts = 2, 2500, 27, np.array([2400, 17], np.int32)
+    absent = scenes * slots
+    index = np.full((scenes, slots, offsets), absent, np.int32)
+    for scene, count in enumerate(counts.tolist()):
+        found = rng.random((count, offsets)) < 0.4
+        index[scene, :count] = np.where(found, scene * slots + rng.integers(0, count, found.shape), absent)
+    table, count = jnp.array(index.reshape(-1, offsets)), jnp.array(counts)
+    draw = lambda *shape: jnp.array(rng.normal(size=shape), jnp.float32)  # noqa: E731
+    features, gradient, kernel = draw(absent, 8), draw(absent, 6), draw(offsets, 8, 6)
+    at_once = sparse.multiply_at_once(features, table, count, kernel)
+    np.testing.assert_allclose(at_once, sparse.multiply_in_blocks(features, table, count, kernel), rtol=0, atol=1e-5)
+    given = (gradient, table, count, jnp.swapaxes(kernel, 1, 2), features.at[2450].set(jnp.nan))
+    for one, other in zip(sparse.gradients_at_once(*given), sparse.gradients_in_blocks(*given), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-4)
