@@ -13,8 +13,10 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 from small import random_scene, random_variables, small_config
 
 from ciassd_jax import create_train_state, predict, tiny, train_step
+from ciassd_jax.model.network import predict_raw
 
-CONFIG = replace(tiny(), dtype="bfloat16")
+# Adding a bias would hide the type of a branch's convolution.
+CONFIG = replace(tiny(), dtype="bfloat16", head=replace(tiny().head, iou_bias=False))
 HALF = jnp.dtype("bfloat16")
 
 
@@ -28,6 +30,11 @@ def infer(state, batch):
 
 def train(state, batch):
     return train_step(state, batch, CONFIG)
+
+
+def raw(state, batch):
+    """Voxels and what the network says of every anchor."""
+    return predict_raw(state, batch.cloud, CONFIG)
 
 
 def arguments():
@@ -68,9 +75,9 @@ def test_only_the_network_rounds(function):
     assert results <= {HALF, jnp.dtype("float32")}
 
 
-@pytest.mark.parametrize("function", [infer, train])
+@pytest.mark.parametrize("function", [raw, infer, train])
 def test_what_goes_in_and_comes_out_is_float32(function):
-    """Parameters, batch statistics, optimiser, detections and metrics."""
+    """Parameters, batch statistics, optimiser; voxels, predictions, detections and metrics."""
     state, batch = arguments()
     leaves = jax.tree.leaves((state, jax.eval_shape(function, state, batch)))
     assert {leaf.dtype for leaf in leaves} <= {jnp.dtype(name) for name in ("float32", "int32", "bool")}
