@@ -31,10 +31,10 @@ SHARED = Path(__file__).parents[2] / "shared"
 def pytest_configure(config: pytest.Config) -> None:
     """Set the compiler's flags; XLA reads them when the first program is compiled.
 
-    The quick suite spends its time in the compiler, so it skips the costly passes. Any other selection of tests
-    (`-m slow`, `-m reference`) runs the programs that users run.
+    The quick suite and the smoke test spend their time in the compiler, so they skip the costly passes. Any other
+    selection of tests (`-m slow`, `-m reference`) runs the programs that users run.
     """
-    level = 0 if config.option.markexpr == "not slow" else None
+    level = 0 if config.option.markexpr in ("not slow", "smoke") else None
     os.environ.setdefault("XLA_FLAGS", xla_flags(devices=2, level=level))
 
 

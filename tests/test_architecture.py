@@ -107,6 +107,7 @@ def test_three_files_stand_at_the_root() -> None:
     assert {path.name for path in PACKAGE.glob("*.py")} == {"__init__.py", "__main__.py", "types.py"}
 
 
+@pytest.mark.smoke
 def test_import_is_silent_and_starts_no_device() -> None:
     code = (
         "import ciassd_jax, sys, jax._src.xla_bridge as bridge; "

@@ -29,6 +29,7 @@ def test_demo_detects_in_simulated_streets(run: Any, weights: Path, tmp_path: Pa
     assert all(f"ciassd_demo/{name}" in last for name in names)
 
 
+@pytest.mark.smoke
 def test_demo_of_a_file_and_weights_of_your_own(run: Any, weights: Path, tmp_path: Path) -> None:
     write_bin(tmp_path / "street.bin", small_cloud())
     result = run("demo", tmp_path / "street.bin", "--weights", weights, "--out", tmp_path / "out")

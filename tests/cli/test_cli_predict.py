@@ -34,6 +34,7 @@ def kitti(tmp_path: Path) -> Path:
     return root
 
 
+@pytest.mark.smoke
 def test_one_cloud_gives_json_and_a_table(run: Any, weights: Path, tmp_path: Path) -> None:
     write_bin(tmp_path / "street.bin", small_cloud())
     result = run("predict", tmp_path / "street.bin", "--weights", weights, "--out", tmp_path / "out" / "deep")

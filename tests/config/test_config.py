@@ -141,6 +141,7 @@ def test_small_presets_keep_the_method(make):
 # JSON
 
 
+@pytest.mark.smoke
 @presets
 def test_json_round_trip(make):
     config = make()
@@ -286,6 +287,7 @@ def test_for_inference_keeps_what_predict_reads():
         assert changed.for_inference() != config.for_inference()
 
 
+@pytest.mark.smoke
 def test_a_config_needs_no_static_argnames():
     traced = []
 

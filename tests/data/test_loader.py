@@ -150,6 +150,7 @@ def test_state_goes_on_with_the_same_bits(mini, expected: list[Scene]) -> None:
     assert_same_bits(take(make(mini, start=4), 2), expected[4:])
 
 
+@pytest.mark.smoke
 def test_workers_change_nothing_and_resume_each_other(mini, expected: list[Scene]) -> None:
     """None to two in the middle of an epoch, and back."""
     with make(mini) as batches:

@@ -193,6 +193,7 @@ def sample() -> dict[str, Any]:
 # ---------------------------------------------------------------------------------------------- what is read
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 def test_a_checkpoint_becomes_plain_data(write: Writer, tmp_path: Path, protocol: int) -> None:
     content = read_torch_file(write(tmp_path / "w.pth", sample(), protocol=protocol))

@@ -37,6 +37,7 @@ def drops(caught: Any) -> str:
     return "\n".join(str(w.message) for w in caught if w.category is DroppedWarning)
 
 
+@pytest.mark.smoke
 @pytest.mark.usefixtures("quiet")
 def test_one_cloud_gives_one_result(detector: Detector) -> None:
     result = detector(small_cloud())

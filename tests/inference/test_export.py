@@ -47,6 +47,7 @@ def expected(cloud: PointCloud) -> Detections:
     return result
 
 
+@pytest.mark.smoke
 def test_artefact_runs_from_its_bytes(artefact: bytes, cloud: PointCloud, expected: Detections) -> None:
     assert export.deserialize(bytearray(artefact)).platforms == PLATFORMS
     result = run_exported(artefact, cloud)

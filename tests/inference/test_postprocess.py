@@ -279,6 +279,7 @@ def sigmoid(value: float) -> float:
     return 1 / (1 + np.exp(-value))
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("config", [car(), car_released()], ids=["car", "released"])
 def test_three_equal_boxes_give_one(config):
     boxes, scores, labels = final(detect(*scene(three_at(20.5)), config))

@@ -57,6 +57,7 @@ def dtypes(variables) -> set:
     return {variable.aval.dtype for variable in variables}
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("function", [infer, train])
 def test_only_the_network_rounds(function):
     """Of both platforms' programs: voxels, targets, losses, boxes, overlap, NMS and the update touch no bfloat16."""
@@ -75,6 +76,7 @@ def test_only_the_network_rounds(function):
     assert results <= {HALF, jnp.dtype("float32")}
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("function", [raw, infer, train])
 def test_what_goes_in_and_comes_out_is_float32(function):
     """Parameters, batch statistics, optimiser; voxels, predictions, detections and metrics."""

@@ -291,6 +291,7 @@ def test_objects_stand_apart_on_the_ground() -> None:
         assert not points_in_boxes(np.zeros((1, 3), np.float32), grown).any()
 
 
+@pytest.mark.smoke
 def test_a_frame_depends_on_its_seed_and_index_alone() -> None:
     first, again, other = (make_frame(3, index, SMALL)[0] for index in (5, 5, 6))
     np.testing.assert_array_equal(first.points, again.points)

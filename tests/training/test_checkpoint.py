@@ -47,6 +47,7 @@ def assert_same_bits(some: TrainState, others: TrainState) -> None:
     jax.tree.map(np.testing.assert_array_equal, some, others)
 
 
+@pytest.mark.smoke
 def test_the_last_and_the_best_are_kept_and_restored(tmp_path: Path, state: TrainState) -> None:
     save(tmp_path, state, {2: 1.0, 4: 5.0, 6: 3.0, 8: None, 10: None})
     with Checkpoints(tmp_path, CONFIG, keep=2) as checkpoints:
@@ -83,6 +84,7 @@ def _lose_progress(folder: Path) -> None:
     shutil.rmtree(folder / "progress")
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("damage", [_truncate, _keep_little, _empty_data, _lose_progress])
 def test_a_damaged_checkpoint_is_replaced_by_the_previous_one(
     damage: Callable[[Path], None], tmp_path: Path, state: TrainState
@@ -213,6 +215,7 @@ def limited_files(size: int) -> Iterator[None]:
 
 
 # Orbax leaves coroutines and callbacks behind.
+@pytest.mark.smoke
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore:coroutine:RuntimeWarning")
 def test_a_failed_write_is_one_sentence_and_keeps_the_earlier_ones(
     tmp_path: Path, state: TrainState, caplog: pytest.LogCaptureFixture

@@ -283,6 +283,7 @@ def smooth_piece(name: str, dtype) -> tuple:
     }[name]
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("name", ["classification", "smooth_l1", "box", "direction", "iou"])
 def test_gradients_match_the_values(name):
     with jax.enable_x64(True):

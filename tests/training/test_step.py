@@ -94,6 +94,7 @@ def test_optimizer_is_clipped_adam_with_decay_first(scale):
         chex.assert_trees_all_close(mine, params, rtol=1e-6)
 
 
+@pytest.mark.smoke
 def test_twenty_steps_learn_and_repeat_bit_for_bit():
     config = short()
 

@@ -118,6 +118,7 @@ def test_numbers_of_the_released_code():
 # The definition
 
 
+@pytest.mark.smoke
 def test_agrees_with_a_plain_loop():
     """Exact labels and matches with ties, ignored anchors, forced anchors and two classes."""
     paper_anchors = np.asarray(to_paper(ANCHORS))

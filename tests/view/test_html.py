@@ -41,6 +41,7 @@ def camera(tmp_path: Path) -> Camera:
     return read_camera(tmp_path / "calib.txt", image_size=IMAGE_SIZE)
 
 
+@pytest.mark.smoke
 def test_points_and_boxes_are_in_the_page() -> None:
     data = data_of(view_html([FRAME, FRAME._replace(name="second")]))
     assert [frame["name"] for frame in data["frames"]] == ["000010", "second"]
