@@ -21,7 +21,6 @@ def counts(curve: Curve) -> list[tuple[int, int, int]]:
     return list(zip(curve.true.tolist(), curve.false.tolist(), curve.missed.tolist(), strict=True))
 
 
-@pytest.mark.smoke
 @pytest.mark.parametrize("seed", range(3))
 def test_agrees_with_plain_loops(seed: int) -> None:
     frames = random_frames(np.random.default_rng(seed), 50)
@@ -42,6 +41,7 @@ def test_agrees_with_plain_loops(seed: int) -> None:
     assert hits > 1000
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("number", [1, 10, 39, 40, 41, 42, 200])
 def test_perfect_detections(number: int) -> None:
     """Every object found: the curve has a point for each, 41 at most."""
