@@ -53,16 +53,17 @@ def summarise(text: str) -> Summary:
     volume: Counter[str] = Counter()
     unknown = steps = conditionals = 0
     for operation in operations(text):
-        name, times = operation.opcode.removesuffix("-start"), operation.times
-        if operation.opcode == "while":
+        opcode, times = operation.opcode, operation.times
+        if opcode == "while":
             length = trip_count(operation)
             unknown, steps = unknown + times * (length is None), steps + times * (length or 0)
-        conditionals += times * (operation.opcode == "conditional")
-        if operation.opcode not in _NO_KERNEL and not operation.opcode.endswith(("-done", "-update")):
-            kernels[name] += times
-        if name in _COLLECTIVES:
-            number[name] += times
-            volume[name] += times * result_bytes(operation)
+        conditionals += times * (opcode == "conditional")
+        if opcode not in _NO_KERNEL and not opcode.endswith(("-done", "-update")):
+            kernels[opcode.removesuffix("-start")] += times
+        # What has started has its result where it is done.
+        if (kind := opcode.removesuffix("-done")) in _COLLECTIVES:
+            number[kind] += times
+            volume[kind] += times * result_bytes(operation.type)
     collectives = {name: (count, volume[name]) for name, count in number.items()}
     return Summary(dict(kernels.most_common()), unknown, steps, conditionals, collectives)
 
@@ -88,16 +89,12 @@ def trip_count(loop: Operation) -> int | None:
     return int(found[1]) if found else None
 
 
-def result_bytes(operation: Operation) -> int:
-    """Bytes of the result, without padding; of an operation that is only started, the result that it will have."""
-    sizes = [
-        int(bits or 8) // 8 * prod(int(n) for n in sizes.split(",") if n)
-        for bits, sizes in _ARRAY.findall(operation.type)
-    ]
-    if operation.opcode.endswith("-start") and operation.opcode != "all-reduce-start":
-        # (operands, results, ...)
-        return max(sizes)
-    return sum(sizes)
+def result_bytes(result: str) -> int:
+    """Bytes of an array or a tuple of arrays of the type `result`, without padding."""
+    return sum(
+        int(bits or 8) // 8 * prod(int(size) for size in sizes.split(",") if size)
+        for bits, sizes in _ARRAY.findall(result)
+    )
 
 
 def _computations(text: str) -> tuple[dict[str, list[Operation]], str]:
