@@ -14,7 +14,7 @@ Letters of shapes:
     C     channels
     S     strided stages of the backbone
     N     classes
-    K     candidates; offsets of a sparse kernel
+    K, J  candidates, or offsets of a sparse kernel; its columns along y and x
     O, Q  objects for ground-truth sampling, their points
 
 Coordinates are in the LiDAR frame: x forward, y left, z up, in metres. Yaw is counter-clockwise from +x, in radians.
@@ -126,25 +126,28 @@ class SparseVoxels(NamedTuple):
 class Sites(NamedTuple):
     """Active sites of one grid by ascending linear key; the key of padding is the largest int32.
 
-    `columns` is the index that finds a site's slot (`ops/sites.py`). For every BEV column (y, x) it has one bit per
-    active z, in words of 32, then the slot of the lowest site. The dense backend has none.
+    `masks` and `starts` find a site's slot (`ops/sites.py`): for every BEV column (y, x) one bit per active z, in words
+    of 32, and the slot of the lowest site, undefined for an empty column. The dense backend has none.
     """
 
     keys: Int[Array, "*b V"]
     count: Int[Array, "*b"]  # type: ignore[assignment]
-    columns: UInt32[Array, "*b columns words"] | None = None
+    masks: UInt32[Array, "*b words Y X"] | None = None
+    starts: Int[Array, "*b Y X"] | None = None
 
 
 class NeighbourTable(NamedTuple):
-    """The input site that each kernel offset reads, and the transposed table for the backward pass.
+    """The input sites that each output site reads, and the transposed table for the backward pass.
 
-    `inputs[o, k]` is the input site under offset k of output site o, `outputs[i, k]` the output site that reads input
-    site i through offset k. A missing site has the number of input (output) slots as its index. The first `num_outputs`
-    and `num_inputs` rows of a scene are real.
+    `inputs[j, v]` is the run (`ops/runs.py`) of the inputs of output site v in column j of its window (y, x), and
+    `outputs[j, u]` the run of the outputs that read input site u. The followers are those of the sites that the runs
+    consist of. The first `num_outputs` and `num_inputs` sites of a scene are real.
     """
 
-    inputs: Int[Array, "*b V K"]
-    outputs: Int[Array, "*b U K"]
+    inputs: Int[Array, "*b J V"]
+    outputs: Int[Array, "*b J U"]
+    input_followers: Int[Array, "*b U"]
+    output_followers: Int[Array, "*b V"]
     num_outputs: Int[Array, "*b"]
     num_inputs: Int[Array, "*b"]
 

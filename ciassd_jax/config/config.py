@@ -37,12 +37,17 @@ class Config:
     # Type of the convolutions; parameters, BatchNorm, coordinates, IoU and NMS stay float32. "float64" serves exact
     # comparisons and needs `jax_enable_x64`.
     dtype: Literal["float32", "bfloat16", "float64"] = "float32"
+    # Form of the computations that a CPU and an accelerator do differently: "auto" chooses by the platform that is
+    # compiled for. "accelerator" runs on a CPU too, slowly.
+    program: Literal["auto", "cpu", "accelerator"] = "auto"
 
     def __post_init__(self) -> None:
         if not self.classes or len({c.name for c in self.classes}) != len(self.classes):
             raise ValueError("classes: give at least one, each with its own name.")
         if self.dtype not in ("float32", "bfloat16", "float64"):
             raise ValueError(f"dtype: {self.dtype!r} is unknown; choose 'float32', 'bfloat16' or 'float64'.")
+        if self.program not in ("auto", "cpu", "accelerator"):
+            raise ValueError(f"program: {self.program!r} is unknown; choose 'auto', 'cpu' or 'accelerator'.")
         multiple = 2 * self.backbone.stride
         for axis, cells in zip("xy", self.grid.cells, strict=False):
             if cells % multiple:

@@ -12,6 +12,7 @@ from ciassd_jax.model.anchors import make_anchors
 from ciassd_jax.model.network import RawPredictions
 from ciassd_jax.ops import boxes as box_ops
 from ciassd_jax.ops import camera, nms
+from ciassd_jax.ops.platform import Program
 from ciassd_jax.ops.rows import take_rows
 from ciassd_jax.types import Array, Boxes, Candidates, Counts, Detections, Predictions
 
@@ -63,11 +64,11 @@ def select_candidates(
 
 
 def suppress(
-    candidates: Candidates, config: DetectionConfig, classes: tuple[ClassConfig, ...]
+    candidates: Candidates, config: DetectionConfig, classes: tuple[ClassConfig, ...], program: Program = "auto"
 ) -> tuple[Candidates, nms.Clusters]:
     """Run the NMS of `config.nms`; return the candidates in its order of selection, and their clusters."""
     if config.nms == "rotated":
-        return candidates, nms.rotated_nms(candidates, overlap=config.nms_iou_threshold)
+        return candidates, nms.rotated_nms(candidates, overlap=config.nms_iou_threshold, program=program)
     run = nms.released_di_nms
     if config.nms == "paper":
         candidates, run = nms.refine_by_anchor_distance(candidates), nms.paper_di_nms
@@ -78,6 +79,7 @@ def suppress(
         support_threshold=thresholds[candidates.label],
         sigma_squared=config.sigma_squared,
         distances=config.sigma_distances,
+        program=program,
     )
 
 
@@ -119,7 +121,7 @@ def postprocess(raw: RawPredictions, config: Config, *, frustum: Float[Array, "B
     def one_scene(scene: RawPredictions, planes: Array | None) -> Detections:
         candidates, dropped = select_candidates(scene.predictions, anchors, labels, config.detection)
         counts = _count(scene, candidates, dropped)
-        candidates, clusters = suppress(candidates, config.detection, config.classes)
+        candidates, clusters = suppress(candidates, config.detection, config.classes, config.program)
         found = finish(candidates, clusters, minimum=minimum, maximum=maximum, frustum=planes)
         boxes, score, label, count = found
         return Detections(boxes._replace(yaw=box_ops.wrap_angle(boxes.yaw)), score, label, count, counts)

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ciassd_jax.config import BackboneConfig
-from ciassd_jax.model.backends import BACKENDS, Window
+from ciassd_jax.model.backends import Window, make_backend
 from ciassd_jax.model.layers import SparseConvNormRelu
 from ciassd_jax.ops import sites as site_ops
+from ciassd_jax.ops.platform import Program
 from ciassd_jax.ops.sites import NO_SITE, Triple
 from ciassd_jax.types import Sites, SparseVoxels
 
@@ -24,6 +25,7 @@ class SPConvNet(nn.Module):
     shape: Triple
     dtype: jnp.dtype
     axis_name: str | None = None
+    program: Program = "auto"
 
     @nn.compact
     def __call__(
@@ -31,7 +33,7 @@ class SPConvNet(nn.Module):
     ) -> tuple[Float[Array, "B H W C"], Int[Array, "B S"], Int[Array, "B S"]]:
         """Return the BEV map, whose channels hold the z layers, and the sites kept and dropped by strided stages."""
         layer = partial(SparseConvNormRelu, dtype=self.dtype, axis_name=self.axis_name)
-        backend, shapes = BACKENDS[self.config.backend], self.config.stage_shapes(self.shape)
+        backend, shapes = make_backend(self.config.backend, self.program), self.config.stage_shapes(self.shape)
         capacities = self.config.capacities(voxels.num_points.shape[-1])
         sites = _sites_of(voxels, self.shape)
         x = jnp.asarray(voxels.features).reshape(-1, voxels.features.shape[-1])
@@ -49,7 +51,7 @@ class SPConvNet(nn.Module):
         window = Window(shapes[-2], shapes[-1], (3, 1, 1), (2, 1, 1), (0, 0, 0))
         sites, convolution, lost = backend.strided(sites, window, capacities[-1])
         x = layer(self.config.out_channels, (3, 1, 1), name="out")(x, convolution, _real(sites), train=train)
-        bev = _fold_height(x.reshape(*sites.keys.shape, -1), sites, shapes[-1])
+        bev = _fold_height(backend.to_dense(x.reshape(*sites.keys.shape, -1), sites, shapes[-1]))
         return bev, jnp.stack([*kept, sites.count], -1), jnp.stack([*dropped, lost], -1)
 
 
@@ -64,8 +66,6 @@ def _real(sites: Sites) -> Bool[Array, " N"]:
     return (sites.keys != NO_SITE).reshape(-1)
 
 
-def _fold_height(features: Float[Array, "B V C"], sites: Sites, shape: Triple) -> Float[Array, "B H W C2"]:
-    """Dense BEV map with channel c * Z + z, as a (C, Z, H, W) tensor folds in the released code."""
-    grid = jnp.asarray(jax.vmap(partial(site_ops.to_dense, shape=shape))(features, sites))
-    depth, height, width = shape
-    return grid.transpose(0, 2, 3, 4, 1).reshape(-1, height, width, features.shape[-1] * depth)
+def _fold_height(grid: Float[Array, "B H W Z C"]) -> Float[Array, "B H W C2"]:
+    """BEV map with channel c * Z + z, as a (C, Z, H, W) tensor folds in the released code."""
+    return jnp.swapaxes(grid, 3, 4).reshape(*grid.shape[:3], -1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,9 @@ from jaxtyping import Array, Int
 from ciassd_jax.model.layers import Convolution
 from ciassd_jax.ops import sites as site_ops
 from ciassd_jax.ops import sparse, sparse_dense
+from ciassd_jax.ops.platform import Program
 from ciassd_jax.ops.sites import Triple
-from ciassd_jax.types import Sites
+from ciassd_jax.types import NeighbourTable, Sites
 
 
 class Window(NamedTuple):
@@ -28,32 +29,39 @@ class Window(NamedTuple):
 
 
 class Backend(NamedTuple):
-    """A pair of functions of the sites of a batch of scenes.
+    """Three functions of the sites of a batch of scenes.
 
     `submanifold(sites, shape)` gives the 3 x 3 x 3 convolution whose output sites are its input sites.
     `strided(sites, window, capacity)` gives the output sites, the convolution onto them, and the number of sites over
-    capacity of each scene.
+    capacity of each scene. `to_dense(features [B, V, C], sites, shape)` gives features on the grid [B, Y, X, Z, C].
     """
 
     submanifold: Callable[[Sites, Triple], Convolution]
     strided: Callable[[Sites, Window, int], tuple[Sites, Convolution, Int[Array, " B"]]]
+    to_dense: Callable[[Array, Sites, Triple], Array]
 
 
-def _gather_submanifold(sites: Sites, shape: Triple) -> Convolution:
-    return _through(jax.vmap(partial(sparse.submanifold_table, shape=shape))(sites))
+def _gather_submanifold(sites: Sites, shape: Triple, *, program: Program) -> Convolution:
+    return _through(jax.vmap(partial(sparse.submanifold_table, shape=shape, program=program))(sites), program)
 
 
-def _gather_strided(sites: Sites, window: Window, capacity: int) -> tuple[Sites, Convolution, Int[Array, " B"]]:
+def _gather_strided(
+    sites: Sites, window: Window, capacity: int, *, program: Program
+) -> tuple[Sites, Convolution, Int[Array, " B"]]:
     geometry: dict[str, Any] = window._asdict()
     out_sites, dropped = jax.vmap(lambda one: site_ops.strided_sites(one, capacity=capacity, **geometry))(sites)
-    tables = jax.vmap(lambda one, out: sparse.strided_table(one, out, **geometry))(sites, out_sites)
-    return out_sites, _through(tables), jnp.asarray(dropped)
+    tables = jax.vmap(lambda one, out: sparse.strided_table(one, out, program=program, **geometry))(sites, out_sites)
+    return out_sites, _through(tables, program), jnp.asarray(dropped)
 
 
-def _through(tables: sparse.NeighbourTable) -> Convolution:
+def _through(tables: NeighbourTable, program: Program) -> Convolution:
     """The convolution through the tables of a batch."""
     table = sparse.flatten_scenes(tables)
-    return lambda features, kernel: jnp.asarray(sparse.convolve(features, table, kernel))
+    return lambda features, kernel: jnp.asarray(sparse.convolve(features, table, kernel, program))
+
+
+def _gather_to_dense(features: Array, sites: Sites, shape: Triple) -> Array:
+    return jnp.asarray(jax.vmap(partial(site_ops.to_dense, shape=shape))(features, sites))
 
 
 def _dense_submanifold(sites: Sites, shape: Triple) -> Convolution:
@@ -91,7 +99,14 @@ def _on_grids(sites: Sites, out_sites: Sites, window: Window) -> Convolution:
     return convolution
 
 
-BACKENDS = {
-    "gather": Backend(_gather_submanifold, _gather_strided),
-    "dense": Backend(_dense_submanifold, _dense_strided),
-}
+def _dense_to_dense(features: Array, sites: Sites, shape: Triple) -> Array:
+    grid = jnp.asarray(jax.vmap(partial(sparse_dense.to_dense, shape=shape))(features, sites))
+    return grid.transpose(0, 2, 3, 1, 4)
+
+
+def make_backend(kind: Literal["gather", "dense"], program: Program = "auto") -> Backend:
+    """Return the backend of `config.backbone.backend`, in the form of `config.program`."""
+    if kind == "dense":
+        return Backend(_dense_submanifold, _dense_strided, _dense_to_dense)
+    strided, submanifold = partial(_gather_strided, program=program), partial(_gather_submanifold, program=program)
+    return Backend(submanifold, strided, _gather_to_dense)

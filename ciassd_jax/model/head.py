@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -9,6 +11,7 @@ from jaxtyping import Array, Float
 from ciassd_jax.config import HeadConfig
 from ciassd_jax.model.layers import uniform_by_fan_in
 from ciassd_jax.ops.convolution import convolve_2d
+from ciassd_jax.ops.platform import Program
 from ciassd_jax.types import Predictions
 
 
@@ -19,6 +22,7 @@ class Branch(nn.Module):
     kernel_size: int
     use_bias: bool
     dtype: jnp.dtype
+    program: Program
 
     @nn.compact
     def __call__(self, x: Float[Array, "B H W C"]) -> Float[Array, "B H W O"]:
@@ -26,7 +30,7 @@ class Branch(nn.Module):
         init = uniform_by_fan_in(size * size * inputs)
         kernel = self.param("kernel", init, (size, size, inputs, self.channels), jnp.float32)
         around = (size // 2, size // 2)
-        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), (around, around))
+        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), (around, around), 1, self.program)
         x = x.astype(jnp.promote_types(self.dtype, jnp.float32))
         if self.use_bias:
             x = x + self.param("bias", init, (self.channels,), jnp.float32).reshape(1, 1, 1, -1)
@@ -39,16 +43,18 @@ class MultiTaskHead(nn.Module):
     config: HeadConfig
     anchors_per_cell: int
     dtype: jnp.dtype
+    program: Program = "auto"
 
     @nn.compact
     def __call__(self, x: Float[Array, "B H W C"]) -> Predictions:
         anchors, batch = self.anchors_per_cell, x.shape[0]
-        box = Branch(7 * anchors, 1, True, self.dtype, name="box")(x)
-        class_logit = Branch(anchors, 1, True, self.dtype, name="class")(x)
-        direction = Branch(2 * anchors, 1, True, self.dtype, name="direction")(x)
+        branch = partial(Branch, dtype=self.dtype, program=self.program)
+        box = branch(7 * anchors, 1, True, name="box")(x)
+        class_logit = branch(anchors, 1, True, name="class")(x)
+        direction = branch(2 * anchors, 1, True, name="direction")(x)
         iou = None
         if self.config.predict_iou:
-            iou = Branch(anchors, self.config.iou_kernel, self.config.iou_bias, self.dtype, name="iou")(x)
+            iou = branch(anchors, self.config.iou_kernel, self.config.iou_bias, name="iou")(x)
             iou = iou.reshape(batch, -1)
         return Predictions(
             box=box.reshape(batch, -1, 7),

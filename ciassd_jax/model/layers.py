@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from ciassd_jax.ops.convolution import convolve_2d, upsample_2d
 from ciassd_jax.ops.normalization import batch_norm, scale_and_shift
+from ciassd_jax.ops.platform import Program
 
 Initializer = Callable[..., Array]
 # A sparse convolution: (features [B * U, C], kernel [K, C, O]) to features [B * V, O], scene after scene.
@@ -95,6 +96,7 @@ class ConvNormRelu(nn.Module):
     stride: int = 1
     relu: bool = True
     axis_name: str | None = None
+    program: Program = "auto"
 
     @nn.compact
     def __call__(self, x: Float[Array, "B H W C"], *, train: bool) -> Float[Array, "B H2 W2 O"]:
@@ -102,7 +104,7 @@ class ConvNormRelu(nn.Module):
         shape = (size, size, inputs, self.channels)
         kernel = self.param("kernel", uniform_by_fan_in(size * size * inputs), shape, jnp.float32)
         around = (size // 2, size // 2)
-        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), (around, around), self.stride)
+        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), (around, around), self.stride, self.program)
         x = MaskedBatchNorm(self.axis_name, name="norm")(x, train=train)
         return nn.relu(x) if self.relu else x
 
@@ -113,6 +115,7 @@ class UpsampleNormRelu(nn.Module):
     channels: int
     dtype: jnp.dtype
     axis_name: str | None = None
+    program: Program = "auto"
 
     @nn.compact
     def __call__(self, x: Float[Array, "B H W C"], *, train: bool) -> Float[Array, "B H2 W2 O"]:
@@ -120,7 +123,5 @@ class UpsampleNormRelu(nn.Module):
         shape = (3, 3, inputs, self.channels)
         # torch takes the fan-in of a transposed convolution from its output channels.
         kernel = self.param("kernel", uniform_by_fan_in(9 * self.channels), shape, jnp.float32)
-        x = MaskedBatchNorm(self.axis_name, name="norm")(
-            upsample_2d(x.astype(self.dtype), kernel.astype(self.dtype)), train=train
-        )
-        return nn.relu(x)
+        x = upsample_2d(x.astype(self.dtype), kernel.astype(self.dtype), self.program)
+        return nn.relu(MaskedBatchNorm(self.axis_name, name="norm")(x, train=train))

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ciassd_jax.config import NeckConfig
 from ciassd_jax.model.layers import ConvNormRelu, UpsampleNormRelu
+from ciassd_jax.ops.platform import Program
 
 
 class SSFA(nn.Module):
@@ -19,12 +20,13 @@ class SSFA(nn.Module):
     config: NeckConfig
     dtype: jnp.dtype
     axis_name: str | None = None
+    program: Program = "auto"
 
     @nn.compact
     def __call__(self, bev: Float[Array, "B H W C"], *, train: bool) -> Float[Array, "B H W D"]:
         width = self.config.channels
-        conv = partial(ConvNormRelu, dtype=self.dtype, axis_name=self.axis_name)
-        upsample = partial(UpsampleNormRelu, dtype=self.dtype, axis_name=self.axis_name)
+        conv = partial(ConvNormRelu, dtype=self.dtype, axis_name=self.axis_name, program=self.program)
+        upsample = partial(UpsampleNormRelu, dtype=self.dtype, axis_name=self.axis_name, program=self.program)
 
         spatial = bev
         for i in range(3):
@@ -58,14 +60,15 @@ class ConvolutionStack(nn.Module):
     config: NeckConfig
     dtype: jnp.dtype
     axis_name: str | None = None
+    program: Program = "auto"
 
     @nn.compact
     def __call__(self, bev: Float[Array, "B H W C"], *, train: bool) -> Float[Array, "B H W D"]:
         width = self.config.channels
         layers = [(width, 3)] * 7 if self.config.kind == "second" else [(2 * width, 3)] * 7 + [(2 * width, 1)]
+        conv = partial(ConvNormRelu, dtype=self.dtype, axis_name=self.axis_name, program=self.program)
         for i, (channels, kernel_size) in enumerate(layers):
-            layer = ConvNormRelu(channels, kernel_size, self.dtype, axis_name=self.axis_name, name=f"conv_{i}")
-            bev = layer(bev, train=train)
+            bev = conv(channels, kernel_size, name=f"conv_{i}")(bev, train=train)
         return bev
 
 

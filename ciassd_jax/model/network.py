@@ -30,11 +30,12 @@ class CIASSD(nn.Module):
     ) -> tuple[Predictions, Int[Array, "B S"], Int[Array, "B S"]]:
         """Predictions, and the active sites kept and dropped at each strided stage of the backbone."""
         config, dtype = self.config, jnp.dtype(self.config.dtype)
-        backbone = SPConvNet(config.backbone, config.grid.shape, dtype, self.axis_name, name="backbone")
+        how: dict[str, Any] = {"dtype": dtype, "axis_name": self.axis_name, "program": config.program}
+        backbone = SPConvNet(config.backbone, config.grid.shape, **how, name="backbone")
         bev, kept, dropped = backbone(voxels, train=train)
         neck = SSFA if config.neck.kind == "ssfa" else ConvolutionStack
-        features = neck(config.neck, dtype, self.axis_name, name="neck")(bev, train=train)
-        head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, name="head")
+        features = neck(config.neck, **how, name="neck")(bev, train=train)
+        head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, config.program, name="head")
         return head(features), kept, dropped
 
 

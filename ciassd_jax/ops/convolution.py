@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from ciassd_jax.ops.platform import Program, by_platform
+
 Padding = tuple[tuple[int, int], tuple[int, int]]
 
 # Cells that a CPU multiplies at once for the gradient of a kernel: they must stay in cache.
@@ -17,9 +19,13 @@ _BLOCK_CELLS = 900
 _FEW_CELLS = 4096
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+@partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
 def convolve_2d(
-    x: Float[Array, "B H W C"], kernel: Float[Array, "Y X C O"], padding: Padding, stride: int = 1
+    x: Float[Array, "B H W C"],
+    kernel: Float[Array, "Y X C O"],
+    padding: Padding,
+    stride: int = 1,
+    program: Program = "auto",
 ) -> Float[Array, "B H2 W2 O"]:
     """Cross-correlate with explicit zero padding.
 
@@ -39,20 +45,26 @@ def convolve_2d(
     )
 
 
-def _forward(x: Array, kernel: Array, padding: Padding, stride: int) -> tuple[Array, tuple[Array, Array]]:
+def _forward(
+    x: Array, kernel: Array, padding: Padding, stride: int, program: Program
+) -> tuple[Array, tuple[Array, Array]]:
     return convolve_2d.fun(x, kernel, padding, stride), (x, kernel)
 
 
-def _backward(padding: Padding, stride: int, saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+def _backward(
+    padding: Padding, stride: int, program: Program, saved: tuple[Array, Array], gradient: Array
+) -> tuple[Array, Array]:
     x, kernel = saved
     (to_x,) = jax.linear_transpose(lambda x: convolve_2d.fun(x, kernel, padding, stride), x)(gradient)
-    return to_x, _kernel_gradients(x, gradient, kernel, padding, stride)
+    return to_x, _kernel_gradients(x, gradient, kernel, padding, stride, program)
 
 
 convolve_2d.defvjp(_forward, _backward)
 
 
-def _kernel_gradients(x: Array, gradient: Array, kernel: Array, padding: Padding, stride: int) -> Array:
+def _kernel_gradients(
+    x: Array, gradient: Array, kernel: Array, padding: Padding, stride: int, program: Program
+) -> Array:
     """Gradient of the kernel of a convolution of x, from that of its result."""
 
     def whole(x: Array, gradient: Array) -> Array:
@@ -64,7 +76,7 @@ def _kernel_gradients(x: Array, gradient: Array, kernel: Array, padding: Padding
         return whole(x, gradient)
     size = (kernel.shape[0], kernel.shape[1])
     blocked = partial(_blocked_kernel_gradient, size=size, padding=padding, stride=stride)
-    return lax.platform_dependent(x, gradient, cpu=blocked, default=whole)
+    return by_platform(program, x, gradient, cpu=blocked, accelerator=whole)
 
 
 def _blocked_kernel_gradient(
@@ -95,8 +107,10 @@ def _blocked_kernel_gradient(
     return total.reshape(*size, channels, out).astype(x.dtype)
 
 
-@jax.custom_vjp
-def upsample_2d(x: Float[Array, "B H W C"], kernel: Float[Array, "3 3 C O"]) -> Float[Array, "B H2 W2 O"]:
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def upsample_2d(
+    x: Float[Array, "B H W C"], kernel: Float[Array, "3 3 C O"], program: Program = "auto"
+) -> Float[Array, "B H2 W2 O"]:
     """Transposed convolution of stride 2, padding 1, output padding 1, as four phase convolutions.
 
     out[2i - 1 + k] += in[i] * kernel[k] per axis: an even output row reads the middle tap alone, an odd one the outer
@@ -112,14 +126,14 @@ def upsample_2d(x: Float[Array, "B H W C"], kernel: Float[Array, "3 3 C O"]) -> 
     return jnp.stack(rows, 2).reshape(batch, 2 * height, 2 * width, -1)
 
 
-def _upsample_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
+def _upsample_forward(x: Array, kernel: Array, program: Program) -> tuple[Array, tuple[Array, Array]]:
     return upsample_2d.fun(x, kernel), (x, kernel)
 
 
-def _upsample_backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+def _upsample_backward(program: Program, saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
     x, kernel = saved
     padding, transposed = ((1, 0), (1, 0)), jnp.swapaxes(kernel, 2, 3)
-    to_kernel = _kernel_gradients(gradient, x, transposed, padding, 2)
+    to_kernel = _kernel_gradients(gradient, x, transposed, padding, 2, program)
     return convolve_2d.fun(gradient, transposed, padding, 2), jnp.swapaxes(to_kernel, 2, 3)
 
 

@@ -6,6 +6,7 @@ iterations; no loop runs over boxes. All functions take one scene of K candidate
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from ciassd_jax.ops.iou import iou_bev
+from ciassd_jax.ops.platform import Program, by_platform
 from ciassd_jax.ops.rows import take_rows
 from ciassd_jax.types import Array, Boxes, Candidates
 
@@ -28,12 +30,21 @@ class Clusters(NamedTuple):
     selected: Bool[Array, " K"]
 
 
-@jax.custom_batching.sequential_vmap
-def pairwise_iou(boxes: Boxes, count: Int[Array, ""]) -> Float[Array, "K K"]:
-    """Rotated BEV IoU of the first `count` boxes with each other, zero elsewhere.
+def pairwise_iou(boxes: Boxes, count: Int[Array, ""], program: Program = "auto") -> Float[Array, "K K"]:
+    """Rotated BEV IoU of the first `count` boxes with each other, zero elsewhere."""
+    overlap = by_platform(program, boxes, count, cpu=_pairs_in_blocks, accelerator=_pairs_at_once)
+    real = jnp.arange(boxes.yaw.shape[0], dtype=jnp.int32) < count
+    return jnp.where(real[:, None] & real[None], overlap, 0)
 
-    Computed in blocks of rows, scene after scene, so that padding costs nothing.
-    """
+
+def _pairs_at_once(boxes: Boxes, count: Int[Array, ""]) -> Float[Array, "K K"]:
+    rows, columns = (jax.tree.map(partial(jnp.expand_dims, axis=axis), boxes) for axis in (1, 0))
+    return iou_bev(rows, columns)
+
+
+@jax.custom_batching.sequential_vmap
+def _pairs_in_blocks(boxes: Boxes, count: Int[Array, ""]) -> Float[Array, "K K"]:
+    """Block of rows after block of rows, scene after scene, so that padding costs nothing; later blocks are zero."""
     capacity = boxes.yaw.shape[0]
     rows = min(_BLOCK_ROWS, capacity)
     blocks = -(-capacity // rows)
@@ -46,9 +57,7 @@ def pairwise_iou(boxes: Boxes, count: Int[Array, ""]) -> Float[Array, "K K"]:
         return lax.dynamic_update_slice_in_dim(result, iou_bev(some, columns), start, 0)
 
     empty = jnp.zeros((blocks * rows, capacity), boxes.yaw.dtype)
-    overlap = lax.fori_loop(jnp.int32(0), (-(-count // rows)).astype(jnp.int32), fill, empty)[:capacity]
-    real = jnp.arange(capacity, dtype=jnp.int32) < count
-    return jnp.where(real[:, None] & real[None], overlap, 0)
+    return lax.fori_loop(jnp.int32(0), (-(-count // rows)).astype(jnp.int32), fill, empty)[:capacity]
 
 
 def _pad_rows(array: Array, rows: int) -> Array:
@@ -68,12 +77,14 @@ def greedy_keep(overlaps: Bool[Array, "K K"], eligible: Bool[Array, " K"]) -> Bo
     return lax.while_loop(lambda state: state[1], step, (jnp.asarray(eligible), jnp.array(True)))[0]
 
 
-def rotated_nms(candidates: Candidates, *, overlap: float, limit: int | None = None) -> Clusters:
+def rotated_nms(
+    candidates: Candidates, *, overlap: float, limit: int | None = None, program: Program = "auto"
+) -> Clusters:
     """Plain NMS within each class: a kept box suppresses later ones of IoU at or above `overlap`.
 
     `limit` keeps the first so many only. Boxes and scores stay as they are.
     """
-    iou, _ = _class_overlap(candidates)
+    iou, _ = _class_overlap(candidates, program)
     selected = greedy_keep(iou >= overlap, candidates.valid)
     if limit is not None:
         selected &= jnp.cumsum(selected, dtype=jnp.int32) <= limit
@@ -87,6 +98,7 @@ def released_di_nms(
     support_threshold: Float[Array, " K"],
     sigma_squared: tuple[float, ...],
     distances: tuple[float, ...],
+    program: Program = "auto",
 ) -> Clusters:
     """DI-NMS as in the released code.
 
@@ -95,7 +107,7 @@ def released_di_nms(
     limit, raw yaw included. The softmax of squared anchor distances refines the reported score only. Boxes beyond the
     last distance have no weight and are not selected.
     """
-    iou, real = _class_overlap(candidates)
+    iou, real = _class_overlap(candidates, program)
     support = jnp.where(iou > 0, iou * candidates.iou[None], 0).sum(1)
     keep = greedy_keep(iou >= overlap, candidates.valid & (support > support_threshold))
     members = (iou > overlap) & real
@@ -114,6 +126,7 @@ def paper_di_nms(
     support_threshold: Float[Array, " K"],
     sigma_squared: tuple[float, ...],
     distances: tuple[float, ...],
+    program: Program = "auto",
 ) -> Clusters:
     """DI-NMS of the paper (Algorithm 1).
 
@@ -122,7 +135,7 @@ def paper_di_nms(
     Each auxiliary box is weighted by the sigma of its own distance, its yaw first aligned to the candidate
     modulo pi.
     """
-    iou, real = _class_overlap(candidates)
+    iou, real = _class_overlap(candidates, program)
     overlaps = (iou > overlap) & real
     keep = greedy_keep(overlaps, candidates.valid)
     # argmax finds the first kept candidate that overlaps each box; a kept one is its own.
@@ -146,12 +159,12 @@ def refine_by_anchor_distance(candidates: Candidates) -> Candidates:
     return take_rows(candidates._replace(score=score), order)
 
 
-def _class_overlap(candidates: Candidates) -> tuple[Float[Array, "K K"], Bool[Array, "K K"]]:
+def _class_overlap(candidates: Candidates, program: Program) -> tuple[Float[Array, "K K"], Bool[Array, "K K"]]:
     """IoU between candidates of one class, zero between classes, and which pairs are real and of one class."""
     count = candidates.valid.sum(dtype=jnp.int32)
     same = candidates.label[:, None] == candidates.label[None]
     same &= candidates.valid[:, None] & candidates.valid[None]
-    return jnp.where(same, pairwise_iou(candidates.boxes, count), 0), same
+    return jnp.where(same, pairwise_iou(candidates.boxes, count, program), 0), same
 
 
 def _masked_softmax(values: Float[Array, " K"], valid: Bool[Array, " K"]) -> Float[Array, " K"]:

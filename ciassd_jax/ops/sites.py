@@ -1,8 +1,8 @@
-"""Active sites of a scene's grid, listed by key and indexed by a map of BEV columns.
+"""Active sites of a scene's grid, listed by key and indexed by maps of BEV columns.
 
-For each column (y, x) the map holds a bit mask of the active z and the slot of the lowest site. The slot of a site is
+For each column (y, x) the maps hold a bit mask of the active z and the slot of the lowest site. The slot of a site is
 that slot plus the number of set bits below it, found in constant time. The active set of a strided convolution is the
-OR of the masks in its window, and its sites are listed from the new map: nothing is sorted.
+OR of the masks in its window, and its sites are listed from the new masks: nothing is sorted.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Bool, Float, Int, UInt32
+from jaxtyping import Float, Int, UInt32
 
 from ciassd_jax.types import Array, Sites
 
@@ -42,18 +42,29 @@ def _quotient(values: Int[Array, "*n"], divisor: int) -> Int[jax.Array, "*n"]:
 def active_sites(keys: Int[Array, " V"], *, shape: Triple) -> Sites:
     """Sites of ascending distinct keys; `NO_SITE` marks padding and comes last."""
     depth, height, width = shape
-    words, slots = -(-depth // 32), keys.shape[0]
+    words, columns = -(-depth // 32), height * width
+    slots = jnp.arange(keys.shape[0], dtype=jnp.int32)
     real = keys != NO_SITE
-    # Padding is dropped outside of the map.
     column = _quotient(keys, depth)
-    bits = _bits_of(keys - column * depth, words)
-    column = jnp.where(real, column, height * width)
-    # A column's bits are distinct, so that their sum is their OR; its slot is that of its first site.
-    first = column != jnp.concatenate([jnp.full(1, -1, jnp.int32), column[:-1]])
-    start = jnp.where(first, jnp.arange(slots, dtype=jnp.uint32), 0)
-    columns = jnp.zeros((height * width, words + 1), jnp.uint32)
-    columns = columns.at[column].add(jnp.concatenate([bits, start[:, None]], 1), mode="drop", indices_are_sorted=True)
-    return Sites(keys, real.sum(dtype=jnp.int32), columns)
+    z = keys - column * depth
+    # A column's bits are distinct, so that their sum is their OR. Padding is dropped outside of the map.
+    place = jnp.where(real, column, columns)
+    by_word = [
+        jnp.zeros(columns, jnp.uint32)
+        .at[place]
+        .add(jnp.where(z >> 5 == i, _bit(z), 0), mode="drop", indices_are_sorted=True)
+        for i in range(words)
+    ]
+    first = real & (column != jnp.concatenate([jnp.full(1, -1, jnp.int32), column[:-1]]))
+    place = jnp.where(first, column, columns + slots)
+    starts = jnp.zeros(columns, jnp.int32).at[place].set(slots, mode="drop", unique_indices=True)
+    masks = jnp.stack(by_word).reshape(words, height, width)
+    return Sites(keys, real.sum(dtype=jnp.int32), masks, starts.reshape(height, width))
+
+
+def _bit(z: Int[Array, "*n"]) -> UInt32[jax.Array, "*n"]:
+    """The bit of z in its word."""
+    return jnp.uint32(1) << (z & 31).astype(jnp.uint32)
 
 
 def strided_sites(
@@ -71,18 +82,17 @@ def strided_sites(
     `shape` and `out_shape` are the grids (z, y, x) before and after. Over capacity, the sites of lowest key are kept
     and the others counted.
     """
-    assert sites.columns is not None, "sites of the dense backend have no map"
-    masks = jnp.asarray(sites.columns)[:, :-1].reshape(*shape[1:], -1)
-    masks = _any_in_window(masks, 0, out_shape[1], kernel[1], stride[1], padding[1])
-    masks = _any_in_window(masks, 1, out_shape[2], kernel[2], stride[2], padding[2])
-    bits = _any_in_depth(masks, shape[0], out_shape[0], kernel[0], stride[0], padding[0])
-    return _list_sites(bits.reshape(-1, bits.shape[-1]), depth=out_shape[0], capacity=capacity)
+    assert sites.masks is not None, "sites of the dense backend have no maps"
+    masks = _any_in_window(sites.masks, 1, out_shape[1], kernel[1], stride[1], padding[1])
+    masks = _any_in_window(masks, 2, out_shape[2], kernel[2], stride[2], padding[2])
+    masks = _any_in_depth(masks, out_shape[0], kernel[0], stride[0], padding[0])
+    return _list_sites(masks, depth=out_shape[0], capacity=capacity)
 
 
 def _any_in_window(
-    bits: UInt32[Array, "Y X W"], axis: int, size: int, kernel: int, stride: int, padding: int
-) -> UInt32[jax.Array, "Y2 X2 W"]:
-    """OR of the masks in the window of each of `size` outputs along y (axis 0) or x (axis 1)."""
+    bits: UInt32[Array, "W Y X"], axis: int, size: int, kernel: int, stride: int, padding: int
+) -> UInt32[jax.Array, "W Y2 X2"]:
+    """OR of the masks in the window of each of `size` outputs along y (axis 1) or x (axis 2)."""
     last = (size - 1) * stride
     around = [(0, 0)] * 3
     around[axis] = (padding, max(0, last + kernel - padding - bits.shape[axis]))
@@ -94,11 +104,11 @@ def _any_in_window(
 
 
 def _any_in_depth(
-    bits: UInt32[Array, "Y X W"], depth: int, size: int, kernel: int, stride: int, padding: int
-) -> UInt32[jax.Array, "Y X W2"]:
+    bits: UInt32[Array, "W Y X"], size: int, kernel: int, stride: int, padding: int
+) -> UInt32[jax.Array, "W2 Y X"]:
     """Mask of the `size` outputs along z whose window holds a set bit; strides of 1 and 2."""
     assert stride in (1, 2), f"a mask cannot be strided by {stride}"
-    words = [jnp.asarray(bits[..., i]) for i in range(bits.shape[-1])]
+    words = [jnp.asarray(word) for word in bits]
     # Bit z + padding of the first mask, then bit z of the others, is the input z: outputs start at -padding.
     words = _shift_up([*words, jnp.zeros_like(words[0])], padding)
     window = words
@@ -111,7 +121,7 @@ def _any_in_depth(
     for i in range(-(-size // 32)):
         outputs = min(size - 32 * i, 32)
         result.append(window[i] & np.uint32(2**outputs - 1))
-    return jnp.stack(result, -1)
+    return jnp.stack(result)
 
 
 def _shift_up(words: list[jax.Array], bits: int) -> list[jax.Array]:
@@ -136,41 +146,54 @@ def _even_bits(word: jax.Array) -> jax.Array:
     return word
 
 
-def _list_sites(bits: UInt32[Array, "columns W"], *, depth: int, capacity: int) -> tuple[Sites, Int[Array, ""]]:
+def _list_sites(bits: UInt32[Array, "W Y X"], *, depth: int, capacity: int) -> tuple[Sites, Int[Array, ""]]:
     """The sites of a map of masks by ascending key, and how many of the highest keys were over capacity."""
-    number = lax.population_count(bits).astype(jnp.int32).sum(1)
+    words, height, width = bits.shape
+    bits = jnp.asarray(bits).reshape(words, -1)
+    number = lax.population_count(bits).astype(jnp.int32).sum(0)
     start = jnp.cumsum(number, dtype=jnp.int32) - number
     found = start[-1] + number[-1]
-    column = jnp.arange(bits.shape[0], dtype=jnp.int32)
+    column = jnp.arange(bits.shape[1], dtype=jnp.int32)
     # A column marks the slot of its lowest site; its other sites follow.
     place = jnp.where((number > 0) & (start < capacity), start, capacity + column)
     first = jnp.zeros(capacity, jnp.int32).at[place].set(column, mode="drop", unique_indices=True)
-    # The largest column so far; a column has at most `depth` sites, so that it is among the last `depth` slots.
-    column_of = lax.reduce_window(first, np.int32(0), lax.max, (depth,), (1,), ((depth - 1, 0),))
+    # A column has at most `depth` sites, so that the largest column so far is among the last `depth` slots.
+    column_of = _largest_so_far(first, depth)
     slot = jnp.arange(capacity, dtype=jnp.int32)
     # Without the barrier it may be fused into the neighbour tables and computed again for each of their entries.
-    z = lax.optimization_barrier(_nth_bit(bits[column_of], slot - start[column_of]))
+    z = lax.optimization_barrier(_nth_bit([word[column_of] for word in bits], slot - start[column_of]))
     real = slot < found
     keys = jnp.where(real, column_of * depth + z, NO_SITE)
     # Sites over capacity leave the map too; the last column that stays may lose only some of its own.
     last = column_of[-1]
-    mine = (real & (column_of == last))[:, None]
-    of_last = jnp.where(mine, _bits_of(z, bits.shape[1]), jnp.uint32(0)).sum(0, dtype=jnp.uint32)
-    trimmed = jnp.where((column == last)[:, None], of_last[None], bits)
-    trimmed = jnp.where((start < capacity)[:, None], trimmed, jnp.uint32(0))
-    columns = jnp.concatenate([trimmed, start.astype(jnp.uint32)[:, None]], 1)
+    mine = real & (column_of == last)
+    trimmed = []
+    for i, word in enumerate(bits):
+        of_last = jnp.where(mine & (z >> 5 == i), _bit(z), 0).sum(dtype=jnp.uint32)
+        trimmed.append(jnp.where(start < capacity, jnp.where(column == last, of_last, word), 0))
+    masks = jnp.stack(trimmed).reshape(words, height, width)
     count = jnp.minimum(found, capacity)
-    return Sites(keys, count, columns), found - count
+    return Sites(keys, count, masks, start.reshape(height, width)), found - count
 
 
-def _nth_bit(bits: UInt32[Array, "V W"], n: Int[Array, " V"]) -> Int[Array, " V"]:
+def _largest_so_far(values: Int[Array, " V"], reach: int) -> Int[jax.Array, " V"]:
+    """Maximum of each value and at least the `reach` - 1 before it; none is negative."""
+    largest, step = jnp.asarray(values), 1
+    while step < min(reach, len(values)):
+        # A TPU's compiler takes most of a minute for a window that slides.
+        largest = jnp.maximum(largest, jnp.pad(largest[:-step], (step, 0)))
+        step *= 2
+    return largest
+
+
+def _nth_bit(words: list[jax.Array], n: Int[Array, " V"]) -> Int[Array, " V"]:
     """Place of the n-th set bit (from 0) of each mask, which has as many."""
-    word, place = bits[:, 0], jnp.zeros_like(n)
-    for i in range(1, bits.shape[1]):
+    word, place = words[0], jnp.zeros_like(n)
+    for i, following in enumerate(words[1:], start=1):
         below = lax.population_count(word).astype(jnp.int32)
         beyond = n >= below
         # `word` stays the word in which the bit is looked for, `n` its rank there.
-        word, place = jnp.where(beyond, bits[:, i], word), jnp.where(beyond, 32 * i, place)
+        word, place = jnp.where(beyond, following, word), jnp.where(beyond, 32 * i, place)
         n = jnp.where(beyond, n - below, n)
     for width in (16, 8, 4, 2, 1):
         below = lax.population_count(word & np.uint32(2**width - 1)).astype(jnp.int32)
@@ -180,58 +203,40 @@ def _nth_bit(bits: UInt32[Array, "V W"], n: Int[Array, " V"]) -> Int[Array, " V"
     return place
 
 
-def _bits_of(z: Int[Array, " V"], words: int) -> UInt32[Array, "V W"]:
-    """The mask of a column in which only z is set."""
-    word = jnp.arange(words, dtype=jnp.int32)[None]
-    bit = jnp.uint32(1) << (z & 31).astype(jnp.uint32)
-    return jnp.where((z >> 5)[:, None] == word, bit[:, None], jnp.uint32(0))
+def to_dense(features: Float[Array, "V C"], sites: Sites, *, shape: Triple) -> Float[Array, "Y X Z C"]:
+    """Return the sites' features on the whole grid `shape` (z, y, x), zero where no site is active."""
+    assert sites.masks is not None, "sites of the dense backend have no maps"
+    z = jnp.arange(shape[0], dtype=jnp.int32)
+    below, active = jnp.zeros((1, 1, 1), jnp.int32), jnp.zeros((1, 1, 1), bool)
+    for i, word in enumerate(sites.masks):
+        bits = jnp.asarray(word)[:, :, None]
+        below += lax.population_count(bits & lower_bits(z - 32 * i)[None, None]).astype(jnp.int32)
+        active |= (bits & jnp.where(z >> 5 == i, _bit(z), 0)[None, None]) != 0
+    slots = jnp.where(active, jnp.asarray(sites.starts)[:, :, None] + below, features.shape[0])
+    return _spread(features, slots, sites.keys)
 
 
-def slots_at(
-    sites: Sites, z: Int[Array, "V KZ"], y: Int[Array, "V KY"], x: Int[Array, "V KX"], *, shape: Triple
-) -> Int[Array, "V K"]:
-    """Return the slots of the sites at all combinations of z, y and x of a row, in C order.
-
-    The number of slots stands for "no site", also outside of the grid `shape` (z, y, x).
-    """
-    depth, height, width = shape
-    slots = sites.keys.shape[0]
-    assert sites.columns is not None, "sites of the dense backend have no map"
-    inside = _within(y, height)[:, :, None] & _within(x, width)[:, None]
-    column = jnp.where(inside, y[:, :, None] * width + x[:, None], 0)
-    entry = jnp.asarray(sites.columns).at[column].get(mode="promise_in_bounds")
-    words, start = entry[:, None, ..., :-1], entry[:, None, ..., -1].astype(jnp.int32)
-    here = z[:, :, None, None]
-    at = jnp.where(_within(here, depth), here, 0)
-    below, active = jnp.zeros((1,) * 4, jnp.int32), jnp.zeros((1,) * 4, bool)
-    for i in range(words.shape[-1]):
-        bit = (at - 32 * i).clip(0, 31).astype(jnp.uint32)
-        lower = jnp.where(at < 32 * (i + 1), (jnp.uint32(1) << bit) - 1, jnp.uint32(0xFFFFFFFF))
-        lower = jnp.where(at < 32 * i, jnp.uint32(0), lower)
-        below += lax.population_count(words[..., i] & lower).astype(jnp.int32)
-        active |= (at >> 5 == i) & ((words[..., i] >> bit) & 1 == 1)
-    found = active & inside[:, None] & _within(here, depth)
-    return jnp.where(found, start + below, slots).reshape(z.shape[0], -1)
+def lower_bits(n: Int[Array, "*n"]) -> UInt32[jax.Array, "*n"]:
+    """A word whose n lowest bits are set: none if n is negative, all from 32 on."""
+    some = (jnp.uint32(1) << n.clip(0, 31).astype(jnp.uint32)) - 1
+    return jnp.where(n >= 32, jnp.uint32(0xFFFFFFFF), some)
 
 
-def _within(index: Int[Array, "*n"], size: int) -> Bool[Array, "*n"]:
-    return (index >= 0) & (index < size)
+@jax.custom_vjp
+def _spread(features: Array, slots: Array, keys: Array) -> jax.Array:
+    """Every cell reads its site, and in the backward pass every site its cell: nothing is scattered."""
+    # The last row serves cells without a site.
+    return jnp.pad(features, ((0, 1), (0, 0))).at[slots].get(mode="promise_in_bounds")
 
 
-def to_dense(features: Float[Array, "V C"], sites: Sites, *, shape: Triple) -> Float[Array, "Z Y X C"]:
-    """Scatter the sites' features to the whole grid (z, y, x), zero where no site is active."""
-    depth, height, width = shape
-    cells = depth * height * width
-    # Padding slots write to distinct places out of bounds and are dropped.
-    place = jnp.where(sites.keys == NO_SITE, cells + jnp.arange(sites.keys.shape[0], dtype=jnp.int32), sites.keys)
-    flat = zeros_after(sites.count, (cells, features.shape[-1]), features.dtype)
-    flat = flat.at[place].set(features, mode="drop", unique_indices=True, indices_are_sorted=True)
-    return flat.reshape(height, width, depth, -1).transpose(2, 0, 1, 3)
+def _spread_forward(features: Array, slots: Array, keys: Array) -> tuple[jax.Array, Array]:
+    return _spread(features, slots, keys), keys
 
 
-def zeros_after(count: Int[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
-    """Return zeros that cannot be allocated before `count`, which is not negative, is known.
+def _spread_backward(keys: Array, gradient: Array) -> tuple[jax.Array, None, None]:
+    real = keys != NO_SITE
+    cells = jnp.asarray(gradient).reshape(-1, gradient.shape[-1])
+    return jnp.where(real[:, None], cells[jnp.where(real, keys, 0)], 0), None, None
 
-    Plain zeros depend on nothing: XLA would allocate those of all layers at the start, and memory would double.
-    """
-    return jnp.broadcast_to(jnp.minimum(count, 0).astype(dtype), shape)
+
+_spread.defvjp(_spread_forward, _spread_backward)

@@ -1,13 +1,14 @@
 """Sparse 3D convolution with static shapes (paper section 3.1).
 
-A scene is a grid (z, y, x) in which only active sites exist (`sites.py`). A neighbour table lists the input site under
-each kernel offset of each output site. A convolution gathers its inputs through the table and multiplies them with the
-kernel, and so does its gradient. `sparse_dense.py` holds the definition that this must equal.
+A scene is a grid (z, y, x) in which only active sites exist (`sites.py`). A neighbour table lists the input sites under
+the kernel of each output site, by column (`runs.py`). A convolution gathers its inputs through the table and multiplies
+them with the kernel, and so does its gradient. `sparse_dense.py` holds the definition that this must equal.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,18 +17,21 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float, Int
 
-from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of, slots_at, zeros_after
+from ciassd_jax.ops import runs as run_ops
+from ciassd_jax.ops.platform import Program, by_platform
+from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of
 from ciassd_jax.types import Array, NeighbourTable, Sites
 
 # Rows that a CPU gathers and multiplies at once: the gathered block must stay in cache.
 _BLOCK_ROWS = 2000
 
 
-def submanifold_table(sites: Sites, *, shape: Triple) -> NeighbourTable:
-    """Neighbours of a 3 x 3 x 3 submanifold convolution, offsets in C order (z, y, x)."""
-    inputs = _inputs(sites, sites, shape=shape, out_shape=shape, kernel=(3, 3, 3), stride=(1, 1, 1), padding=(1, 1, 1))
-    # The transposed table is the table with its offsets reversed.
-    return NeighbourTable(inputs, inputs[:, ::-1], sites.count, sites.count)
+def submanifold_table(sites: Sites, *, shape: Triple, program: Program = "auto") -> NeighbourTable:
+    """Neighbours of a 3 x 3 x 3 submanifold convolution."""
+    inputs = _inputs(sites, sites, shape, (3, 3, 3), (1, 1, 1), (1, 1, 1), shape, program)
+    following = run_ops.followers(sites, depth=shape[0])
+    # What a site reads also reads it.
+    return NeighbourTable(inputs, inputs, following, following, sites.count, sites.count)
 
 
 def strided_table(
@@ -39,134 +43,170 @@ def strided_table(
     kernel: Triple,
     stride: Triple,
     padding: Triple,
+    program: Program = "auto",
 ) -> NeighbourTable:
-    """Neighbours of a strided convolution from `sites` to `out_sites`, offsets in C order (z, y, x)."""
-    geometry = {"shape": shape, "out_shape": out_shape, "kernel": kernel, "stride": stride, "padding": padding}
-    inputs, outputs = _inputs(sites, out_sites, **geometry), _outputs(sites, out_sites, **geometry)
-    return NeighbourTable(inputs, outputs, out_sites.count, sites.count)
+    """Neighbours of a strided convolution from `sites` to `out_sites`; a kernel of 1 or 3 along y and x, 3 along z."""
+    axes = list(zip(kernel, stride, strict=True))
+    assert axes[0][0] == run_ops.DEPTH, f"runs have three z, the kernel {kernel[0]}"
+    assert set(axes) <= {(1, 1), (3, 1), (3, 2)}, f"no runs for a kernel of {kernel} with strides of {stride}"
+    return NeighbourTable(
+        _inputs(sites, out_sites, shape, kernel, stride, padding, out_shape, program),
+        _outputs(sites, out_sites, shape, kernel, stride, padding, out_shape, program),
+        run_ops.followers(sites, depth=shape[0]),
+        run_ops.followers(out_sites, depth=out_shape[0], step=stride[0]),
+        out_sites.count,
+        sites.count,
+    )
 
 
 def _inputs(
-    sites: Sites, out_sites: Sites, *, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple
-) -> Int[Array, "V K"]:
-    """Slots of the inputs at o * stride - padding + k of every output o."""
-    real = (out_sites.keys != NO_SITE)[:, None]
-    axes = [
-        jnp.where(real, o[:, None] * s - p + jnp.arange(k, dtype=jnp.int32)[None], -1)
-        for o, k, s, p in zip(coordinates_of(out_sites.keys, out_shape).T, kernel, stride, padding, strict=True)
-    ]
-    return slots_at(sites, *axes, shape=shape)
+    sites: Sites,
+    out_sites: Sites,
+    shape: Triple,
+    kernel: Triple,
+    stride: Triple,
+    padding: Triple,
+    out_shape: Triple,
+    program: Program,
+) -> Int[Array, "J V"]:
+    """Runs of the inputs of every output o, from o * stride - padding on."""
+    z, y, x = (o * s - p for o, s, p in zip(coordinates_of(out_sites.keys, out_shape).T, stride, padding, strict=True))
+    # Padding reads beside the grid.
+    y = jnp.where(out_sites.keys != NO_SITE, y, shape[1])
+    return run_ops.pack(*run_ops.runs_at(sites, z, y, x, size=kernel[1:], program=program))
 
 
 def _outputs(
-    sites: Sites, out_sites: Sites, *, shape: Triple, out_shape: Triple, kernel: Triple, stride: Triple, padding: Triple
-) -> Int[Array, "U K"]:
-    """Slots of the outputs at (i + padding - k) / stride of every input i, where that is whole."""
-    assert set(stride) <= {1, 2}, f"the stride {stride} is not 1 or 2 along each axis"
-    real = (sites.keys != NO_SITE)[:, None]
-    axes = []
-    for i, k, s, p in zip(coordinates_of(sites.keys, shape).T, kernel, stride, padding, strict=True):
-        shifted = i[:, None] + p - jnp.arange(k, dtype=jnp.int32)[None]
-        # A shift halves negative numbers downwards.
-        axes.append(jnp.where(real & (shifted & (s - 1) == 0), shifted >> (s - 1), -1))
-    return slots_at(out_sites, *axes, shape=out_shape)
+    sites: Sites,
+    out_sites: Sites,
+    shape: Triple,
+    kernel: Triple,
+    stride: Triple,
+    padding: Triple,
+    out_shape: Triple,
+    program: Program,
+) -> Int[Array, "J U"]:
+    """Runs of the outputs that read every input i: (i + padding - k) / stride, where that is whole, by descending k."""
+    z, y, x = (i + p for i, p in zip(coordinates_of(sites.keys, shape).T, padding, strict=True))
+    first = [(n >> 1) - 1 if s == 2 else n - (k - 1) for n, s, k in zip((z, y, x), stride, kernel, strict=True)]
+    first[1] = jnp.where(sites.keys != NO_SITE, first[1], out_shape[1])
+    columns = [2 if s == 2 else k for s, k in zip(stride[1:], kernel[1:], strict=True)]
+    slot, mask = run_ops.runs_at(out_sites, *first, size=(columns[0], columns[1]), program=program)
+    if stride[0] == 2:
+        # An even z is read through the outer offsets of two outputs, an odd one through the middle of the second.
+        lower, upper = mask & 1, mask >> 1 & 1
+        odd = (z & 1 != 0)[None, None]
+        slot, mask = jnp.where(odd, slot + lower, slot), jnp.where(odd, 2 * upper, lower + 4 * upper)
+    for axis, n in ((0, y), (1, x)):
+        if stride[1 + axis] == 2:
+            odd = (n & 1 != 0)[None]
+            (slot_0, slot_1), (mask_0, mask_1) = jnp.moveaxis(slot, axis, 0), jnp.moveaxis(mask, axis, 0)
+            slot = jnp.stack([slot_0, slot_1, slot_1], axis)
+            mask = jnp.stack([jnp.where(odd, 0, mask_0), jnp.where(odd, mask_1, 0), jnp.where(odd, 0, mask_1)], axis)
+    return run_ops.pack(slot, mask)
 
 
 def flatten_scenes(table: NeighbourTable) -> NeighbourTable:
     """Tables of a batch as one table over the slots of all scenes, scene after scene."""
 
-    def flatten(index: Int[Array, "B V K"], slots: int) -> Int[Array, "N K"]:
-        scenes = index.shape[0]
-        first = slots * jnp.arange(scenes, dtype=jnp.int32)[:, None, None]
-        return jnp.where(index < slots, index + first, scenes * slots).reshape(-1, index.shape[-1])
+    def flatten(runs: Int[Array, "B J V"], slots: int) -> Int[Array, "J N"]:
+        first = slots * jnp.arange(runs.shape[0], dtype=jnp.int32)[:, None, None]
+        return (runs + 8 * first).transpose(1, 0, 2).reshape(runs.shape[1], -1)
 
-    inputs = flatten(table.inputs, table.outputs.shape[1])
-    outputs = flatten(table.outputs, table.inputs.shape[1])
-    return NeighbourTable(inputs, outputs, table.num_outputs, table.num_inputs)
+    inputs, outputs = table.input_followers, table.output_followers
+    assert max(inputs.size, outputs.size) < 2**28, "more site slots in a batch than a packed run can name"
+    return NeighbourTable(
+        flatten(table.inputs, inputs.shape[1]),
+        flatten(table.outputs, outputs.shape[1]),
+        inputs.reshape(-1),
+        outputs.reshape(-1),
+        table.num_outputs,
+        table.num_inputs,
+    )
 
 
-@jax.custom_vjp
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
 def convolve(
-    features: Float[Array, "U C"], table: NeighbourTable, kernel: Float[Array, "K C O"]
+    features: Float[Array, "U C"], table: NeighbourTable, kernel: Float[Array, "K C O"], program: Program = "auto"
 ) -> Float[Array, "V O"]:
-    """Sparse convolution (cross-correlation, no bias): out[v] = sum_k features[table.inputs[v, k]] @ kernel[k].
+    """Sparse convolution (cross-correlation, no bias) with a kernel whose offsets are in C order (z, y, x).
 
     Rows without neighbours are zero. The backward pass gathers through `table.outputs`; nothing is scattered, so that
     results repeat bit for bit on every device. Accumulates in float32 or wider.
     """
-    return _multiply_on_platform(features, table, kernel)
-
-
-def _multiply_on_platform(features: Array, table: NeighbourTable, kernel: Array) -> jax.Array:
-    operands = (features, table.inputs, table.num_outputs, kernel)
-    return jnp.asarray(lax.platform_dependent(*operands, cpu=multiply_in_blocks, default=multiply_at_once))
+    operands = (features, table.inputs, table.input_followers, table.num_outputs, kernel)
+    return jnp.asarray(by_platform(program, *operands, cpu=multiply_in_blocks, accelerator=multiply_at_once))
 
 
 def _convolve_forward(
-    features: Float[Array, "U C"], table: NeighbourTable, kernel: Float[Array, "K C O"]
+    features: Float[Array, "U C"], table: NeighbourTable, kernel: Float[Array, "K C O"], program: Program
 ) -> tuple[Float[Array, "V O"], tuple[Array, NeighbourTable, Array]]:
-    return _multiply_on_platform(features, table, kernel), (features, table, kernel)
+    return convolve(features, table, kernel, program), (features, table, kernel)
 
 
 def _convolve_backward(
-    saved: tuple[Array, NeighbourTable, Array], gradient: Float[Array, "V O"]
+    program: Program, saved: tuple[Array, NeighbourTable, Array], gradient: Float[Array, "V O"]
 ) -> tuple[Array, NeighbourTable, Array]:
     features, table, kernel = saved
-    transposed = jnp.swapaxes(kernel, 1, 2)
-    to_features, to_kernel = lax.platform_dependent(
-        gradient,
-        table.outputs,
-        table.num_inputs,
-        transposed,
-        features,
-        cpu=gradients_in_blocks,
-        default=gradients_at_once,
-    )
+    # The outputs that read an input come in ascending order, which is the descending one of the offsets.
+    transposed = jnp.swapaxes(kernel[::-1], 1, 2)
+    operands = (gradient, table.outputs, table.output_followers, table.num_inputs, transposed, features)
+    to_features, to_kernel = by_platform(program, *operands, cpu=gradients_in_blocks, accelerator=gradients_at_once)
     no_gradient = NeighbourTable(*(np.zeros(t.shape, jax.dtypes.float0) for t in table))
-    return to_features, no_gradient, to_kernel
+    return to_features, no_gradient, to_kernel[::-1]
 
 
 convolve.defvjp(_convolve_forward, _convolve_backward)
 
 
-def _product(a: Array, b: Array, dtype: jnp.dtype) -> jax.Array:
-    """Matrix product in full precision, accumulated in float32 or wider."""
+def _product(equation: str, a: Array, b: Array, dtype: jnp.dtype) -> jax.Array:
+    """Contraction in full precision, accumulated in float32 or wider."""
     accumulator = jnp.promote_types(dtype, jnp.float32)
-    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST, preferred_element_type=accumulator)
+    return jnp.einsum(equation, a, b, precision=lax.Precision.HIGHEST, preferred_element_type=accumulator)
 
 
-def _with_zero_row(rows: Float[Array, "U C"]) -> Float[jax.Array, "U1 C"]:
-    """The rows and one of zeros, which absent neighbours read."""
-    return jnp.pad(rows, ((0, 1), (0, 0)))
+# All rows at once, for accelerators. J columns of runs, each of three offsets along z.
+
+
+def multiply_at_once(
+    features: Array, runs: Int[Array, "J V"], following: Int[Array, " U"], count: Array, kernel: Array
+) -> Array:
+    gathered = _gather_windows(features, runs, following)
+    return _product("jvc,jco->vo", gathered, _by_column(kernel), features.dtype).astype(features.dtype)
+
+
+def gradients_at_once(
+    gradient: Array, runs: Int[Array, "J U"], following: Int[Array, " V"], count: Array, kernel: Array, features: Array
+) -> tuple[Array, Array]:
+    """Gradients of features and kernel [K, C, O] from the output's, of which one gather serves both.
+
+    `runs` are of the outputs that read each feature row, and `kernel` is [K, O, C].
+    """
+    gathered = _gather_windows(gradient, runs, following)
+    to_features = _product("jvo,joc->vc", gathered, _by_column(kernel), features.dtype)
+    to_kernel = _product("vc,jvo->jco", _real_rows(features, count), gathered, features.dtype)
+    depth, (columns, channels, _) = run_ops.DEPTH, to_kernel.shape
+    to_kernel = to_kernel.reshape(columns, channels, depth, -1).transpose(2, 0, 1, 3)
+    to_kernel = to_kernel.reshape(depth * columns, channels, -1)
+    return to_features.astype(features.dtype), to_kernel.astype(kernel.dtype)
+
+
+def _gather_windows(rows: Array, runs: Int[Array, "J V"], following: Array) -> Float[Array, "J V C3"]:
+    """The rows of three offsets along z, side by side, of each column."""
+    index = run_ops.first_rows(runs, rows.shape[0])
+    return jnp.asarray(run_ops.windows(rows, following)).at[index].get(mode="promise_in_bounds")
+
+
+def _by_column(kernel: Float[Array, "K C O"]) -> Float[Array, "J C3 O"]:
+    """The kernel with the offsets along z beside the channels, as in `windows`."""
+    depth, (offsets, channels, out) = run_ops.DEPTH, kernel.shape
+    return kernel.reshape(depth, -1, channels, out).transpose(1, 0, 2, 3).reshape(offsets // depth, -1, out)
 
 
 def _real_rows(values: Array, count: Int[Array, "*b"]) -> Array:
     """The rows of real sites, zero elsewhere: padding slots may hold anything."""
     real = jnp.arange(values.shape[0] // count.size, dtype=jnp.int32)[None] < count.reshape(-1, 1)
     return jnp.where(real.reshape(-1, 1), values, 0)
-
-
-# All rows at once, for accelerators.
-
-
-def multiply_at_once(features: Array, index: Array, count: Array, kernel: Array) -> Array:
-    gathered = _with_zero_row(features).at[index].get(mode="promise_in_bounds").reshape(index.shape[0], -1)
-    return _product(gathered, kernel.reshape(-1, kernel.shape[-1]), features.dtype).astype(features.dtype)
-
-
-def gradients_at_once(
-    gradient: Array, index: Array, count: Array, kernel: Array, features: Array
-) -> tuple[Array, Array]:
-    """Gradients of features and kernel [K, C, O] from the output's, of which one gather serves both.
-
-    `index` [U, K] lists the outputs that read a feature row, and `kernel` is [K, O, C].
-    """
-    columns, out, channels = kernel.shape
-    gathered = _with_zero_row(gradient).at[index].get(mode="promise_in_bounds").reshape(index.shape[0], -1)
-    to_features = _product(gathered, kernel.reshape(-1, channels), features.dtype)
-    to_kernel = _product(_real_rows(features, count).T, gathered, features.dtype)
-    to_kernel = to_kernel.reshape(channels, columns, out).transpose(1, 0, 2)
-    return to_features.astype(features.dtype), to_kernel.astype(kernel.dtype)
 
 
 # Block after block of the real rows of each scene, for a CPU.
@@ -221,22 +261,37 @@ class _Blocks:
         return whole.reshape(self.rows, -1)
 
 
-def multiply_in_blocks(features: Array, index: Array, count: Array, kernel: Array) -> Array:
+def _zeros_after(count: Int[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
+    """Zeros that cannot be allocated before `count`, which is not negative, is known.
+
+    Plain zeros depend on nothing: XLA would allocate those of all layers at the start, and memory would double.
+    """
+    return jnp.broadcast_to(jnp.minimum(count, 0).astype(dtype), shape)
+
+
+def _with_zero_row(rows: Float[Array, "U C"]) -> Float[jax.Array, "U1 C"]:
+    """The rows and one of zeros, which absent neighbours read."""
+    return jnp.pad(rows, ((0, 1), (0, 0)))
+
+
+def multiply_in_blocks(features: Array, runs: Array, following: Array, count: Array, kernel: Array) -> Array:
+    index = run_ops.slots(runs, absent=features.shape[0])
     blocks, out = _Blocks(index, count), kernel.shape[-1]
     index, padded = blocks.pad(index, features.shape[0]), _with_zero_row(features)
     kernel = kernel.reshape(-1, out)
 
     def multiply(start: Array, end: Array, result: Array) -> Array:
-        product = _product(blocks.gather(padded, index, start), kernel, features.dtype)
+        product = _product("vc,co->vo", blocks.gather(padded, index, start), kernel, features.dtype)
         return lax.dynamic_update_slice_in_dim(result, product.astype(features.dtype), start, 0)
 
-    empty = zeros_after(blocks.count[0], (index.shape[0], out), features.dtype)
+    empty = _zeros_after(blocks.count[0], (index.shape[0], out), features.dtype)
     return blocks.crop(blocks.accumulate(multiply, empty))
 
 
 def gradients_in_blocks(
-    gradient: Array, index: Array, count: Array, kernel: Array, features: Array
+    gradient: Array, runs: Array, following: Array, count: Array, kernel: Array, features: Array
 ) -> tuple[Array, Array]:
+    index = run_ops.slots(runs, absent=gradient.shape[0])
     blocks, (columns, out, channels) = _Blocks(index, count), kernel.shape
     index, padded = blocks.pad(index, gradient.shape[0]), _with_zero_row(gradient)
     features = blocks.pad(features)
@@ -245,13 +300,13 @@ def gradients_in_blocks(
     def accumulate(start: Array, end: Array, results: tuple[Array, Array]) -> tuple[Array, Array]:
         to_features, to_kernel = results
         gathered = blocks.gather(padded, index, start)
-        block = _product(gathered, kernel_rows, features.dtype).astype(features.dtype)
+        block = _product("vo,oc->vc", gathered, kernel_rows, features.dtype).astype(features.dtype)
         to_features = lax.dynamic_update_slice_in_dim(to_features, block, start, 0)
         real = start + jnp.arange(blocks.rows, dtype=jnp.int32)[:, None] < end
         rows = jnp.where(real, lax.dynamic_slice_in_dim(features, start, blocks.rows), 0)
-        return to_features, to_kernel + _product(rows.T, gathered, features.dtype)
+        return to_features, to_kernel + _product("vc,vo->co", rows, gathered, features.dtype)
 
-    empty = zeros_after(blocks.count[0], features.shape, features.dtype)
+    empty = _zeros_after(blocks.count[0], features.shape, features.dtype)
     zero = jnp.zeros((channels, columns * out), jnp.promote_types(features.dtype, jnp.float32))
     to_features, to_kernel = blocks.accumulate(accumulate, (empty, zero))
     to_kernel = to_kernel.reshape(channels, columns, out).transpose(1, 0, 2)

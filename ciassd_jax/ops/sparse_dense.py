@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float, Int
 
-from ciassd_jax.ops.sites import NO_SITE, Triple, linear_keys, to_dense
+from ciassd_jax.ops.sites import NO_SITE, Triple, linear_keys
 from ciassd_jax.types import Array, Sites
 
 
@@ -60,3 +60,14 @@ def convolve(
     by_key = dense.transpose(1, 2, 0, 3).reshape(-1, dense.shape[-1])
     real = out_sites.keys != NO_SITE
     return jnp.where(real[:, None], by_key[jnp.where(real, out_sites.keys, 0)], 0)
+
+
+def to_dense(features: Float[Array, "V C"], sites: Sites, *, shape: Triple) -> Float[Array, "Z Y X C"]:
+    """Scatter the sites' features to the whole grid (z, y, x), zero where no site is active."""
+    depth, height, width = shape
+    cells = depth * height * width
+    # Padding slots write to distinct places out of bounds and are dropped.
+    place = jnp.where(sites.keys == NO_SITE, cells + jnp.arange(sites.keys.shape[0], dtype=jnp.int32), sites.keys)
+    flat = jnp.zeros((cells, features.shape[-1]), features.dtype)
+    flat = flat.at[place].set(features, mode="drop", unique_indices=True, indices_are_sorted=True)
+    return flat.reshape(height, width, depth, -1).transpose(2, 0, 1, 3)

@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
+from ciassd_jax.ops.rows import take_rows
 from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of, linear_keys
 from ciassd_jax.types import Array, PointCloud, SparseVoxels
 
@@ -78,10 +79,7 @@ def voxelize(
     keys, order = lax.sort((keys, slots), num_keys=1, is_stable=True)
     is_first = (keys != jnp.concatenate([jnp.full(1, -1, jnp.int32), keys[:-1]])) & (keys != NO_SITE)
     touched = is_first.sum(dtype=jnp.int32)
-    # The point that would open voxel number max_voxels + 1; none when all voxels fit.
-    first_touches = jnp.sort(jnp.where(is_first, order, capacity))
-    limit = first_touches[max_voxels] if max_voxels < capacity else jnp.int32(capacity)
-
+    limit = _first_over_capacity(is_first, order, max_voxels)
     kept = is_first & (order < limit)
     rank = jnp.cumsum(kept, dtype=jnp.int32)
     count = rank[-1]
@@ -89,28 +87,43 @@ def voxelize(
     # Where each kept voxel begins in the sorted list. Every other slot writes to a distinct place out of bounds.
     place = jnp.where(kept, rank - 1, max_voxels + slots)
     start = jnp.zeros(max_voxels, jnp.int32).at[place].set(slots, mode="drop", unique_indices=True)
-    # Slots of the voxel's first points in the sorted list: they share its key.
-    member = jnp.minimum(start[:, None] + jnp.arange(max_points, dtype=jnp.int32)[None], capacity - 1)
-    distinct = start[:, None] + jnp.arange(max_points, dtype=jnp.int32)[None] < capacity
-    used = real[:, None] & distinct & (keys[member] == keys[start][:, None])
-    if overflow == "stop":
-        used &= order[member] < limit
-    num_points = used.sum(1, dtype=jnp.int32)
-    values = jnp.where(used[..., None], cloud.points[order[member]], 0)
-    total = jnp.broadcast_to(jnp.maximum(num_points, 1).astype(values.dtype)[:, None], values[:, 0].shape)
+    usable = keys != NO_SITE if overflow == "skip" else (keys != NO_SITE) & (order < limit)
+    total, number = _sums_of_runs(cloud.points[order], keys, usable, max_points)
+    total, number, key, first_point = take_rows((total, number, keys, order), start)
+    num_points = jnp.where(real, number, 0)
     in_range = inside.sum(dtype=jnp.int32)
     # A point's voxel was kept if the last kept voxel that begins at or before it has its key.
-    in_kept = (keys != NO_SITE) & (count > 0) & (keys == keys[start][jnp.maximum(rank - 1, 0)])
-    if overflow == "stop":
-        in_kept &= order < limit
+    in_kept = usable & (count > 0) & (keys == key[jnp.maximum(rank - 1, 0)])
     return SparseVoxels(
-        features=values.sum(1) / total,
-        coordinates=jnp.where(real[:, None], coordinates_of(keys[start], shape), 0),
+        features=jnp.where(real[:, None], total, 0) / jnp.maximum(num_points, 1).astype(total.dtype)[:, None],
+        coordinates=jnp.where(real[:, None], coordinates_of(key, shape), 0),
         num_points=num_points,
-        first_point=jnp.where(real, order[start], capacity),
+        first_point=jnp.where(real, first_point, capacity),
         count=count,
         dropped=touched - count,
         points_given=jnp.asarray(cloud.count),
         points_in_range=in_range,
         points_dropped=(given & ~finite).sum(dtype=jnp.int32) + in_range - in_kept.sum(dtype=jnp.int32),
     )
+
+
+def _first_over_capacity(is_first: Bool[Array, " P"], order: Int[Array, " P"], max_voxels: int) -> Int[Array, ""]:
+    """The point that would open voxel number max_voxels + 1; the number of points if all voxels fit."""
+    capacity = len(order)
+    if max_voxels >= capacity:
+        return jnp.int32(capacity)
+    opens = jnp.zeros(capacity, jnp.int32).at[order].set(is_first.astype(jnp.int32), unique_indices=True)
+    return (jnp.cumsum(opens, dtype=jnp.int32) <= max_voxels).sum(dtype=jnp.int32)
+
+
+def _sums_of_runs(
+    points: Float[Array, "P 4"], keys: Int[Array, " P"], usable: Bool[Array, " P"], most: int
+) -> tuple[Float[Array, "P 4"], Int[Array, " P"]]:
+    """For each point of the sorted list, sum and number of it and up to `most` - 1 further ones of the same key."""
+    total, number = jnp.zeros_like(points), jnp.zeros(len(keys), jnp.int32)
+    for k in range(most):
+        ahead = lambda array, fill, k=k: jnp.concatenate([array[k:], jnp.full_like(array[:k], fill)])  # noqa: E731
+        mine = (ahead(keys, NO_SITE) == keys) & ahead(usable, False)
+        total += jnp.where(mine[:, None], ahead(points, 0), 0)
+        number += mine
+    return total, number

@@ -11,10 +11,11 @@ import pytest
 from jax.test_util import check_grads
 from oracles import sparse_convolution_loop
 
+from ciassd_jax.ops import runs as run_ops
 from ciassd_jax.ops import sites as site_ops
 from ciassd_jax.ops import sparse, sparse_dense
 from ciassd_jax.ops.sites import NO_SITE
-from ciassd_jax.types import NeighbourTable, Sites
+from ciassd_jax.types import Sites
 
 
 class Geometry(NamedTuple):
@@ -71,13 +72,19 @@ def random_kernels(seed: int, plan=PLAN) -> list[jax.Array]:
     return [jnp.array(rng.normal(size=size) / np.sqrt(size[0] * size[1]), jnp.float32) for size in sizes]
 
 
-def gathered_layer(sites, features, kernel, shape, geometry, capacity):
+def gathered_layer(sites, features, kernel, shape, geometry, capacity, program="cpu"):
     """Sites after the layer, how many were dropped, and their features."""
     if geometry == SUBMANIFOLD:
-        return sites, jnp.int32(0), sparse.convolve(features, sparse.submanifold_table(sites, shape=shape), kernel)
+        table = sparse.submanifold_table(sites, shape=shape, program=program)
+        return sites, jnp.int32(0), sparse.convolve(features, table, kernel, program)
     where = {"shape": shape, "out_shape": geometry.out_shape(shape), **geometry._asdict()}
     out_sites, dropped = site_ops.strided_sites(sites, capacity=capacity, **where)
-    return out_sites, dropped, sparse.convolve(features, sparse.strided_table(sites, out_sites, **where), kernel)
+    table = sparse.strided_table(sites, out_sites, program=program, **where)
+    return out_sites, dropped, sparse.convolve(features, table, kernel, program)
+
+
+on_accelerator = partial(gathered_layer, program="accelerator")
+FORMS = {"cpu": gathered_layer, "accelerator": on_accelerator}
 
 
 def dense_layer(sites, features, kernel, shape, geometry, capacity):
@@ -101,7 +108,7 @@ def flat_layer(sites, features, kernel, shape, geometry, capacity):
     return out_sites, dropped, sparse.convolve(features, sparse.flatten_scenes(tables), kernel)
 
 
-run_gathered = partial(jax.jit, static_argnames=("shape", "geometry", "capacity"))(gathered_layer)
+run_gathered = partial(jax.jit, static_argnames=("shape", "geometry", "capacity", "program"))(gathered_layer)
 active_sites = partial(jax.jit, static_argnames="shape")(site_ops.active_sites)
 submanifold_table = partial(jax.jit, static_argnames="shape")(sparse.submanifold_table)
 run_dense = partial(jax.jit, static_argnames=("shape", "geometry", "capacity"))(dense_layer)
@@ -142,15 +149,14 @@ GRIDS = {
 
 
 @pytest.mark.parametrize("occupied", [0.0, 0.002, 0.05, 0.4, 1.0])
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("grid", GRIDS)
-def test_gathered_equals_dense(grid, occupied):
+def test_gathered_equals_dense(grid, form, occupied):
     shape, capacities = GRIDS[grid]
     slots = np.prod(shape)
     sites = sites_of(random_coordinates(0, shape, round(occupied * slots)), shape, slots)
     arguments = sites, random_features(1, slots), random_kernels(2)
-    gathered, gathered_gradients = run_plan_with_gradients(
-        gathered_layer, *arguments, shape=shape, capacities=capacities
-    )
+    gathered, gathered_gradients = run_plan_with_gradients(FORMS[form], *arguments, shape=shape, capacities=capacities)
     dense, dense_gradients = run_plan_with_gradients(dense_layer, *arguments, shape=shape, capacities=capacities)
     for (mine, dropped, features), (reference, expected_dropped, expected) in zip(gathered, dense, strict=True):
         np.testing.assert_array_equal(mine.keys, reference.keys)
@@ -168,8 +174,9 @@ def test_gathered_equals_dense(grid, occupied):
         np.testing.assert_allclose(mine / scale, reference / scale, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("capacities", [(80, 80, 20, 10), (30, 30, 6, 3)])
-def test_gradients_in_float64(capacities):
+def test_gradients_in_float64(capacities, form):
     """Of all four kinds of layer, with and without overflow."""
     shape, slots = (13, 4, 5), 60
     with jax.enable_x64(True):
@@ -178,7 +185,7 @@ def test_gradients_in_float64(capacities):
 
         @jax.jit
         def total(features, kernels):
-            stages = plan(gathered_layer, sites, features, kernels, shape=shape, capacities=capacities)
+            stages = plan(FORMS[form], sites, features, kernels, shape=shape, capacities=capacities)
             return [values for *_, values in stages]
 
         assert all(values.dtype == jnp.float64 for values in total(features, kernels))
@@ -187,12 +194,13 @@ def test_gradients_in_float64(capacities):
 
 @pytest.mark.parametrize("number", [0, 1, 60, 280])
 @pytest.mark.parametrize(("name", "shape"), [*((name, (7, 5, 8)) for name in LAYERS), ("submanifold", (70, 2, 2))])
-def test_equals_the_loop(name, number, shape):
+@pytest.mark.parametrize("program", FORMS)
+def test_equals_the_loop(name, number, shape, program):
     geometry, capacity = LAYERS[name], 300
     coordinates = random_coordinates(number, shape, number)
     features, kernel = random_features(1, capacity), random_kernels(2, (geometry,))[0]
     sites = sites_of(coordinates, shape, capacity)
-    out_sites, dropped, result = run_gathered(sites, features, kernel, shape, geometry, capacity)
+    out_sites, dropped, result = run_gathered(sites, features, kernel, shape, geometry, capacity, program)
     expected_coordinates, expected = sparse_convolution_loop(
         coordinates,
         np.asarray(features[:number]),
@@ -243,54 +251,38 @@ def test_equals_the_released_code(shared: Path, case):
     np.testing.assert_allclose(values[order], reference["out_features_sorted"], rtol=0, atol=1e-5)
 
 
-def random_pairs(seed: int, inputs: int, outputs: int, offsets: int, live: np.ndarray) -> NeighbourTable:
-    """A table with no grid behind it: each offset pairs some inputs with some of the `live` outputs."""
-    rng = np.random.default_rng(seed)
-    forth, back = np.full((outputs, offsets), inputs, np.int32), np.full((inputs, offsets), outputs, np.int32)
-    for k in range(offsets):
-        number = min(inputs, len(live)) * 2 // 3
-        rows, columns = rng.permutation(live)[:number], rng.permutation(inputs)[:number]
-        forth[rows, k], back[columns, k] = columns, rows
-    return NeighbourTable(jnp.array(forth), jnp.array(back), jnp.int32(outputs), jnp.int32(inputs))
-
-
 @jax.jit
 def convolve_with_gradients(features, table, kernel, cotangent):
     result, pull_back = jax.vjp(lambda f, k: sparse.convolve(f, table, k), features, kernel)
     return result, pull_back(cotangent.astype(result.dtype))
 
 
-@pytest.mark.parametrize("live", [[], [2499], [*range(1100, 1110)], [*range(0, 2500, 7)], [*range(2500)]])
-def test_more_rows_than_one_block(live):
+@pytest.mark.parametrize("number", [0, 3, 1000, 2400, 4500])
+@pytest.mark.parametrize("geometry", [SUBMANIFOLD, DOWN])
+def test_more_rows_than_one_block(geometry, number):
     """Blocks of rows, some of them empty, in value and in both gradients."""
-    inputs, outputs, offsets = 2100, 2500, 3
-    table = random_pairs(0, inputs, outputs, offsets, np.array(live, int))
-    features, kernel = random_features(1, inputs, 4), random_features(2, offsets * 4, 5).reshape(offsets, 4, 5)
-    cotangent = random_features(3, outputs, 5)
-    result, gradients = convolve_with_gradients(features, table, kernel, cotangent)
-
-    features, kernel, cotangent = (np.asarray(a, np.float64) for a in (features, kernel, cotangent))
-    padded = np.concatenate([features, np.zeros((1, 4))])
-    gathered = padded[np.asarray(table.inputs)]
-    np.testing.assert_allclose(result, np.einsum("vkc,kco->vo", gathered, kernel), rtol=0, atol=1e-5)
-    to_features = np.zeros((inputs + 1, 4))
-    np.add.at(to_features, np.asarray(table.inputs), np.einsum("vo,kco->vkc", cotangent, kernel))
-    np.testing.assert_allclose(gradients[0], to_features[:-1], rtol=0, atol=1e-5)
-    to_kernel = np.einsum("vkc,vo->kco", gathered, cotangent)
-    np.testing.assert_allclose(gradients[1], to_kernel, rtol=1e-5, atol=1e-5 * max(1, abs(to_kernel).max()))
+    shape, capacity = (12, 20, 24), 4600
+    sites, features = sites_of(random_coordinates(0, shape, number), shape, capacity), random_features(1, capacity)
+    arguments = sites, features, random_kernels(2, (geometry,))[0]
+    results = [run_layer_with_gradients(layer, *arguments, shape, geometry) for layer in (dense_layer, *FORMS.values())]
+    reference, *forms = results
+    for mine in forms:
+        np.testing.assert_array_equal(mine[0], reference[0])
+        for values, expected in zip(mine[1:], reference[1:], strict=True):
+            scale = max(1, abs(expected).max())
+            np.testing.assert_allclose(values / scale, expected / scale, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("number", [3, 1000, 2400])
-def test_grids_of_more_rows_than_one_block(number):
-    shape, capacity = (12, 15, 16), 2600
-    coordinates = random_coordinates(0, shape, number)
-    sites, features = sites_of(coordinates, shape, capacity), random_features(1, capacity)
-    for geometry in (SUBMANIFOLD, DOWN):
-        arguments = sites, features, random_kernels(2, (geometry,))[0], shape, geometry, capacity
-        (mine, *gathered), (reference, *dense) = run_gathered(*arguments), run_dense(*arguments)
-        np.testing.assert_array_equal(mine.keys, reference.keys)
-        for values, expected in zip(gathered, dense, strict=True):
-            np.testing.assert_allclose(values, expected, rtol=0, atol=1e-5)
+@partial(jax.jit, static_argnums=(0, 4, 5))
+def run_layer_with_gradients(layer, sites, features, kernel, shape, geometry):
+    """Keys and features after a layer, and the gradients of a sum of them by features and kernel."""
+
+    def total(features, kernel):
+        out_sites, _, values = layer(sites, features, kernel, shape, geometry, len(sites.keys))
+        return (values * jnp.cos(jnp.arange(values.size).reshape(values.shape))).sum(), (out_sites.keys, values)
+
+    gradients, (keys, values) = jax.grad(total, argnums=(0, 1), has_aux=True)(features, kernel)
+    return keys, values, *gradients
 
 
 def test_a_batch_is_its_scenes():
@@ -423,35 +415,58 @@ def test_the_map_of_strided_sites_is_that_of_their_list(shape, capacity):
     for number in (0, 1, 30, 200):
         sites, _ = find(sites_of(random_coordinates(number, shape, number), shape, 250))
         listed = active_sites(sites.keys, shape=where["out_shape"])
-        occupied = np.asarray(listed.columns)[:, :-1].any(1)
-        np.testing.assert_array_equal(np.asarray(sites.columns)[:, :-1], np.asarray(listed.columns)[:, :-1])
-        np.testing.assert_array_equal(np.asarray(sites.columns)[occupied], np.asarray(listed.columns)[occupied])
+        occupied = np.asarray(listed.masks).any(0)
+        np.testing.assert_array_equal(sites.masks, listed.masks)
+        np.testing.assert_array_equal(np.asarray(sites.starts)[occupied], np.asarray(listed.starts)[occupied])
         assert sites.count == listed.count
 
 
-def test_to_dense_puts_each_site_in_its_place():
-    shape, number = (3, 4, 5), 17
-    coordinates, features = random_coordinates(0, shape, number), random_features(1, 30)
-    grid = site_ops.to_dense(features, sites_of(coordinates, shape, 30), shape=shape)
+@pytest.mark.parametrize("shape", [(3, 4, 5), (37, 3, 2)])
+def test_to_dense_puts_each_site_in_its_place(shape):
+    """And its gradient is that of a scatter; what stands in padding slots does not matter."""
+    number, slots = 17, 30
+    coordinates, features = random_coordinates(0, shape, number), random_features(1, slots)
+    sites = sites_of(coordinates, shape, slots)
+    grid, pull_back = jax.vjp(
+        lambda rows: site_ops.to_dense(rows, sites, shape=shape), features.at[number:].set(jnp.nan)
+    )
+    scattered, pull_back_scattered = jax.vjp(lambda rows: sparse_dense.to_dense(rows, sites, shape=shape), features)
     expected = np.zeros((*shape, features.shape[1]), np.float32)
     expected[tuple(coordinates.T)] = features[:number]
-    np.testing.assert_array_equal(grid, expected)
+    np.testing.assert_array_equal(grid.transpose(2, 0, 1, 3), expected)
+    np.testing.assert_array_equal(scattered, expected)
+    cotangent = random_features(2, grid.size // features.shape[1]).reshape(grid.shape)
+    (gradient,), (reference,) = pull_back(cotangent), pull_back_scattered(cotangent.transpose(2, 0, 1, 3))
+    np.testing.assert_array_equal(gradient, reference)
 
 
-def test_the_accelerators_form_equals_the_cpus():
-    """All rows at once, and block after block of the real rows; padding rows of features may be NaN."""
+@pytest.mark.parametrize("shape", [(41, 7, 100), (70, 3, 3), (3, 2, 300)])
+def test_lines_read_what_cells_read(shape):
+    """Windows of every size and place, some of them beside the grid."""
+    number = np.prod(shape) // 3
+    sites = sites_of(random_coordinates(0, shape, number), shape, number)
     rng = np.random.default_rng(0)
-    scenes, slots, offsets, counts = 2, 2500, 27, np.array([2400, 17], np.int32)
-    absent = scenes * slots
-    index = np.full((scenes, slots, offsets), absent, np.int32)
-    for scene, count in enumerate(counts.tolist()):
-        found = rng.random((count, offsets)) < 0.4
-        index[scene, :count] = np.where(found, scene * slots + rng.integers(0, count, found.shape), absent)
-    table, count = jnp.array(index.reshape(-1, offsets)), jnp.array(counts)
-    draw = lambda *shape: jnp.array(rng.normal(size=shape), jnp.float32)  # noqa: E731
-    features, gradient, kernel = draw(absent, 8), draw(absent, 6), draw(offsets, 8, 6)
-    at_once = sparse.multiply_at_once(features, table, count, kernel)
-    np.testing.assert_allclose(at_once, sparse.multiply_in_blocks(features, table, count, kernel), rtol=0, atol=1e-5)
-    given = (gradient, table, count, jnp.swapaxes(kernel, 1, 2), features.at[2450].set(jnp.nan))
-    for one, other in zip(sparse.gradients_at_once(*given), sparse.gradients_in_blocks(*given), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-4)
+    z, y, x = (jnp.array(rng.integers(-4, n + 3, 500), jnp.int32) for n in shape)
+    for size in ((1, 1), (3, 3), (2, 2), (3, 1)):
+        (slot, mask), (line_slot, line_mask) = (
+            run_ops.runs_at(sites, z, y, x, size=size, program=program) for program in ("cpu", "accelerator")
+        )
+        np.testing.assert_array_equal(line_mask, mask)
+        np.testing.assert_array_equal(np.where(mask != 0, line_slot, 0), np.where(mask != 0, slot, 0))
+        assert (mask != 0).sum() > 100
+
+
+def test_runs_name_the_sites_of_a_window():
+    """Slots and offsets, against a search of the list of sites."""
+    shape, number = (40, 3, 4), 200
+    coordinates = random_coordinates(0, shape, number)
+    sites = sites_of(coordinates, shape, number)
+    slot_of = {tuple(place): slot for slot, place in enumerate(coordinates.tolist())}
+    z, y, x = (jnp.array(axis) for axis in np.mgrid[-2:42, 0:3, 0:4].reshape(3, -1).astype(np.int32))
+    runs = run_ops.pack(*run_ops.runs_at(sites, z, y, x, size=(1, 1), program="cpu"))
+    slots = np.asarray(run_ops.slots(runs, absent=number))
+    expected = [
+        [slot_of.get((a + k, b, c), number) for k in range(3)]
+        for a, b, c in zip(*(a.tolist() for a in (z, y, x)), strict=True)
+    ]
+    np.testing.assert_array_equal(slots, np.array(expected))
