@@ -16,7 +16,7 @@ from ciassd_jax import Boxes, Config, GroundTruth, PointCloud, Scene, create_tra
 from ciassd_jax.inference.postprocess import postprocess
 from ciassd_jax.model.anchors import make_anchors
 from ciassd_jax.model.backbone import SPConvNet
-from ciassd_jax.model.backends import BACKENDS, Window
+from ciassd_jax.model.backends import Window, make_backend
 from ciassd_jax.model.head import MultiTaskHead
 from ciassd_jax.model.neck import SSFA
 from ciassd_jax.model.network import predict_raw, voxelize_batch
@@ -62,17 +62,17 @@ def train_step(config: Config, batch: int) -> Program:
 
 def predict_parts(config: Config, batch: int) -> Iterator[Program]:
     """The parts of `predict`, from points to boxes."""
-    dtype = jnp.dtype(config.dtype)
+    how: dict[str, Any] = {"dtype": jnp.dtype(config.dtype), "program": config.program}
     cloud = scenes(config, batch).cloud
     variables = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
     of = lambda part: {name: tree[part] for name, tree in variables.items() if part in tree}  # noqa: E731
     voxelizer = partial(voxelize_batch, grid=config.grid)
     yield "voxelize", voxelizer, (cloud,)
     yield from sparse_parts(config, jax.eval_shape(voxelizer, cloud))
-    bev = shape(batch, *config.bev_shape, config.bev_channels, dtype=dtype)
-    yield "neck", partial(SSFA(config.neck, dtype).apply, train=False), (of("neck"), bev)
-    features = shape(batch, *config.bev_shape, config.neck.channels, dtype=dtype)
-    yield "head", MultiTaskHead(config.head, config.anchors_per_cell, dtype).apply, (of("head"), features)
+    bev = shape(batch, *config.bev_shape, config.bev_channels, dtype=how["dtype"])
+    yield "neck", partial(SSFA(config.neck, **how).apply, train=False), (of("neck"), bev)
+    features = shape(batch, *config.bev_shape, config.neck.channels, dtype=how["dtype"])
+    yield "head", MultiTaskHead(config.head, config.anchors_per_cell, **how).apply, (of("head"), features)
     raw = jax.eval_shape(partial(predict_raw, config=config), variables, cloud)
     yield "postprocess", partial(postprocess, config=config), (raw,)
 
@@ -106,7 +106,7 @@ def sparse_parts(config: Config, voxels: SparseVoxels) -> Iterator[Program]:
             yield name, layers, (sites, rows(), kernels)
             channels = stage.channels
     features = shape(*sites.keys.shape, channels, dtype=dtype)
-    yield "fold to BEV", partial(fold_to_bev, shape=shapes[-1]), (features, sites)
+    yield "fold to BEV", partial(fold_to_bev, config=config), (features, sites)
 
 
 def sites_of(voxels: SparseVoxels, *, shape: site_ops.Triple) -> Sites:
@@ -116,34 +116,36 @@ def sites_of(voxels: SparseVoxels, *, shape: site_ops.Triple) -> Sites:
 
 
 def strided_layer(sites: Sites, features: Any, kernel: Any, *, config: Config, window: Window, capacity: int) -> Any:
-    out, convolution, _ = BACKENDS[config.backbone.backend].strided(sites, window, capacity)
+    out, convolution, _ = make_backend(config.backbone.backend, config.program).strided(sites, window, capacity)
     return out, jax.nn.relu(convolution(features, kernel))
 
 
 def submanifold_layers(sites: Sites, features: Any, kernels: Any, *, config: Config, shape: site_ops.Triple) -> Any:
-    convolution = BACKENDS[config.backbone.backend].submanifold(sites, shape)
+    convolution = make_backend(config.backbone.backend, config.program).submanifold(sites, shape)
     for kernel in kernels:
         features = jax.nn.relu(convolution(features, kernel))
     return features
 
 
-def fold_to_bev(features: Any, sites: Sites, *, shape: site_ops.Triple) -> Any:
-    grid = jax.vmap(partial(site_ops.to_dense, shape=shape))(features, sites)
-    return jnp.asarray(grid).transpose(0, 2, 3, 4, 1).reshape(features.shape[0], *shape[1:], -1)
+def fold_to_bev(features: Any, sites: Sites, *, config: Config) -> Any:
+    shape = config.backbone.stage_shapes(config.grid.shape)[-1]
+    grid = make_backend(config.backbone.backend, config.program).to_dense(features, sites, shape)
+    return jnp.swapaxes(grid, 3, 4).reshape(*grid.shape[:3], -1)
 
 
 def train_parts(config: Config, batch: int) -> Iterator[Program]:
     """The parts of `train_step`, each with its gradient."""
-    batched, dtype = scenes(config, batch), jnp.dtype(config.dtype)
+    batched, how = scenes(config, batch), {"dtype": jnp.dtype(config.dtype), "program": config.program}
     variables = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
     voxelizer = partial(voxelize_batch, grid=config.grid)
     yield "voxelize", voxelizer, (batched.cloud,)
     voxels = jax.eval_shape(voxelizer, batched.cloud)
-    bev = shape(batch, *config.bev_shape, config.bev_channels, dtype=dtype)
-    features = shape(batch, *config.bev_shape, config.neck.channels, dtype=dtype)
-    backbone = partial(SPConvNet(config.backbone, config.grid.shape, dtype).apply, train=True, mutable=["batch_stats"])
-    neck = partial(SSFA(config.neck, dtype).apply, train=True, mutable=["batch_stats"])
-    head = MultiTaskHead(config.head, config.anchors_per_cell, dtype).apply
+    bev = shape(batch, *config.bev_shape, config.bev_channels, dtype=how["dtype"])
+    features = shape(batch, *config.bev_shape, config.neck.channels, dtype=how["dtype"])
+    train = {"train": True, "mutable": ["batch_stats"]}
+    backbone = partial(SPConvNet(config.backbone, config.grid.shape, **how).apply, **train)
+    neck = partial(SSFA(config.neck, **how).apply, **train)
+    head = MultiTaskHead(config.head, config.anchors_per_cell, **how).apply
     for name, apply, given, fixed in (
         ("backbone", backbone, voxels.features, voxels),
         ("neck", neck, bev, None),
