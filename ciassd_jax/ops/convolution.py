@@ -111,11 +111,27 @@ def _blocked_kernel_gradient(
 def upsample_2d(
     x: Float[Array, "B H W C"], kernel: Float[Array, "3 3 C O"], program: Program = "auto"
 ) -> Float[Array, "B H2 W2 O"]:
-    """Transposed convolution of stride 2, padding 1, output padding 1, as four phase convolutions.
+    """Transposed convolution of stride 2, padding 1, output padding 1: out[2i - 1 + k] += in[i] * kernel[k] per axis.
 
-    out[2i - 1 + k] += in[i] * kernel[k] per axis: an even output row reads the middle tap alone, an odd one the outer
-    two. The backward pass is the strided convolution that this transposes.
+    The backward pass is the strided convolution that this transposes.
     """
+    return jnp.asarray(by_platform(program, x, kernel, cpu=_upsample_by_phases, accelerator=_upsample_dilated))
+
+
+def _upsample_dilated(x: Array, kernel: Array) -> Array:
+    return lax.conv_general_dilated(
+        x,
+        kernel[::-1, ::-1],
+        (1, 1),
+        ((1, 2), (1, 2)),
+        lhs_dilation=(2, 2),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=lax.Precision.HIGHEST,
+    )
+
+
+def _upsample_by_phases(x: Array, kernel: Array) -> Array:
+    """Four convolutions: an even output row reads the middle tap alone, an odd one the outer two."""
     taps = (slice(1, 2), slice(2, None, -2))
 
     def phase(odd_y: int, odd_x: int) -> Array:
@@ -127,7 +143,7 @@ def upsample_2d(
 
 
 def _upsample_forward(x: Array, kernel: Array, program: Program) -> tuple[Array, tuple[Array, Array]]:
-    return upsample_2d.fun(x, kernel), (x, kernel)
+    return upsample_2d(x, kernel, program), (x, kernel)
 
 
 def _upsample_backward(program: Program, saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Bool, Int, UInt32
+from jaxtyping import Bool, Float, Int, UInt32
 
 from ciassd_jax.ops.platform import Program, by_platform
 from ciassd_jax.ops.sites import NO_SITE, lower_bits
@@ -88,22 +88,24 @@ def _read_lines(
     cells = max(_LANES // count, size[1])
     step = cells - more
     lines = -(-(width + more) // step)
-    padded = jnp.pad(maps, ((0, 0), (0, 0), (more, (lines + 1) * step - more - width)))
-    padded = padded.reshape(count, height, lines + 1, step)
-    table = jnp.concatenate([padded[:, :, :-1], padded[:, :, 1:, :more]], -1).transpose(1, 2, 0, 3)
-    table = table.reshape(height * lines, count * cells)
-    # Windows that lie beside the grid read any line; its cells there, or the whole row, count as empty.
-    first = (x + more).clip(0, width + more - 1)
+    stretches = []
+    for one in maps:
+        padded = jnp.pad(one, ((0, 0), (more, (lines + 1) * step - more - width))).reshape(height, lines + 1, step)
+        stretches += [padded[:, :-1], padded[:, 1:, :more]]
+    table = jnp.concatenate(stretches, -1).reshape(height * lines, -1)
+    rows = (y[None] + jnp.arange(size[0], dtype=jnp.int32)[:, None]).reshape(-1)
+    # Windows beside the grid read the first line, and their columns count as empty.
+    first = jnp.tile(x + more, size[0])
+    inside = _within(rows, height) & _within(first, width + more)
+    first = jnp.where(inside, first, 0)
     line = lax.div(first, np.int32(step))
-    rows = y[None] + jnp.arange(size[0], dtype=jnp.int32)[:, None]
-    inside = _within(rows, height) & _within(x + more, width + more)[None]
-    read = table.at[jnp.where(inside, rows * lines + line[None], 0).reshape(-1)].get(mode="promise_in_bounds")
-    read = jnp.where(inside.reshape(-1, 1), read, 0).reshape(*inside.shape, -1)
-    lane = jnp.arange(read.shape[-1], dtype=jnp.int32)[None, None]
-    offset = (first - line * step)[None, :, None]
+    read = table.at[jnp.where(inside, rows, 0) * lines + line].get(mode="promise_in_bounds")
+    lane = jnp.arange(table.shape[1], dtype=jnp.int32)[None]
+    offset = (first - line * step)[:, None]
 
     def cell(number: int, column: int) -> Array:
-        return jnp.where(lane == offset + (number * cells + column), read, 0).sum(-1)
+        value = jnp.where(lane == offset + (number * cells + column), read, 0).sum(1, dtype=jnp.int32)
+        return jnp.where(inside, value, 0).reshape(size[0], -1)
 
     return jnp.stack([jnp.stack([cell(number, column) for column in range(size[1])], 1) for number in range(count)])
 
@@ -133,10 +135,11 @@ def first_rows(runs: Int[Array, "J N"], rows: int) -> Int[Array, "J N"]:
     return jnp.where(mask == 0, 3 * rows, offset * rows + slot)
 
 
-def windows(rows: Array, following: Int[Array, " N"]) -> Array:
-    """Every run that begins with a site, as one row [3 N + 1, 3 C]: by first offset, then slot; the last is zero.
+def windows(rows: Float[Array, "N C"], following: Int[Array, " N"]) -> Float[jax.Array, "N3 2 D"]:
+    """Every run that begins with a site, by first offset, then slot; the last is zero.
 
-    `following` are the `followers` of the rows.
+    A run is three offsets of C channels, in two halves. That way a TPU reads the 2 x 128 numbers of one run; of rows in
+    a matrix it would read eight, the height of its tiles. `following` are the `followers` of the rows.
     """
     second, third = following & 2 != 0, following & 4 != 0
     ahead = [jnp.pad(rows[k:], ((0, k), (0, 0))) for k in (1, 2)]
@@ -146,7 +149,15 @@ def windows(rows: Array, following: Int[Array, " N"]) -> Array:
     zero = jnp.zeros_like(own)
     by_offset = ((own, next_one, next_but_one), (zero, own, next_one), (zero, zero, own))
     every = jnp.concatenate([jnp.concatenate(window, 1) for window in by_offset])
-    return jnp.pad(every, ((0, 1), (0, 0)))
+    return in_halves(jnp.pad(every, ((0, 1), (0, 0))), 1)
+
+
+def in_halves(values: Float[Array, "*n"], axis: int) -> Float[jax.Array, "*m"]:
+    """The axis as two of half the size, an odd one after one more zero."""
+    size = values.shape[axis]
+    padding = [(0, 0)] * values.ndim
+    padding[axis] = (0, size % 2)
+    return jnp.pad(values, padding).reshape(*values.shape[:axis], 2, -(-size // 2), *values.shape[axis + 1 :])
 
 
 def slots(runs: Int[Array, "J N"], absent: int) -> Int[Array, "N K"]:

@@ -150,7 +150,7 @@ def _list_sites(bits: UInt32[Array, "W Y X"], *, depth: int, capacity: int) -> t
     """The sites of a map of masks by ascending key, and how many of the highest keys were over capacity."""
     words, height, width = bits.shape
     bits = jnp.asarray(bits).reshape(words, -1)
-    number = lax.population_count(bits).astype(jnp.int32).sum(0)
+    number = lax.population_count(bits).astype(jnp.int32).sum(0, dtype=jnp.int32)
     start = jnp.cumsum(number, dtype=jnp.int32) - number
     found = start[-1] + number[-1]
     column = jnp.arange(bits.shape[1], dtype=jnp.int32)

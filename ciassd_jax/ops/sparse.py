@@ -172,7 +172,7 @@ def multiply_at_once(
     features: Array, runs: Int[Array, "J V"], following: Int[Array, " U"], count: Array, kernel: Array
 ) -> Array:
     gathered = _gather_windows(features, runs, following)
-    return _product("jvc,jco->vo", gathered, _by_column(kernel), features.dtype).astype(features.dtype)
+    return _product("jvhc,jhco->vo", gathered, _by_column(kernel), features.dtype).astype(features.dtype)
 
 
 def gradients_at_once(
@@ -183,24 +183,26 @@ def gradients_at_once(
     `runs` are of the outputs that read each feature row, and `kernel` is [K, O, C].
     """
     gathered = _gather_windows(gradient, runs, following)
-    to_features = _product("jvo,joc->vc", gathered, _by_column(kernel), features.dtype)
-    to_kernel = _product("vc,jvo->jco", _real_rows(features, count), gathered, features.dtype)
-    depth, (columns, channels, _) = run_ops.DEPTH, to_kernel.shape
-    to_kernel = to_kernel.reshape(columns, channels, depth, -1).transpose(2, 0, 1, 3)
-    to_kernel = to_kernel.reshape(depth * columns, channels, -1)
+    to_features = _product("jvho,jhoc->vc", gathered, _by_column(kernel), features.dtype)
+    to_kernel = _product("vc,jvho->jhoc", _real_rows(features, count), gathered, features.dtype)
+    offsets, out, channels = kernel.shape
+    to_kernel = to_kernel.reshape(len(runs), -1, channels)[:, : run_ops.DEPTH * out]
+    to_kernel = to_kernel.reshape(len(runs), run_ops.DEPTH, out, channels).transpose(1, 0, 3, 2)
+    to_kernel = to_kernel.reshape(offsets, channels, out)
     return to_features.astype(features.dtype), to_kernel.astype(kernel.dtype)
 
 
-def _gather_windows(rows: Array, runs: Int[Array, "J V"], following: Array) -> Float[Array, "J V C3"]:
-    """The rows of three offsets along z, side by side, of each column."""
+def _gather_windows(rows: Array, runs: Int[Array, "J V"], following: Array) -> Float[Array, "J V 2 D"]:
+    """The run of each column, in two halves."""
     index = run_ops.first_rows(runs, rows.shape[0])
-    return jnp.asarray(run_ops.windows(rows, following)).at[index].get(mode="promise_in_bounds")
+    return run_ops.windows(rows, following).at[index].get(mode="promise_in_bounds")
 
 
-def _by_column(kernel: Float[Array, "K C O"]) -> Float[Array, "J C3 O"]:
+def _by_column(kernel: Float[Array, "K C O"]) -> Float[Array, "J 2 D O"]:
     """The kernel with the offsets along z beside the channels, as in `windows`."""
     depth, (offsets, channels, out) = run_ops.DEPTH, kernel.shape
-    return kernel.reshape(depth, -1, channels, out).transpose(1, 0, 2, 3).reshape(offsets // depth, -1, out)
+    by_column = kernel.reshape(depth, -1, channels, out).transpose(1, 0, 2, 3)
+    return run_ops.in_halves(by_column.reshape(offsets // depth, -1, out), 1)
 
 
 def _real_rows(values: Array, count: Int[Array, "*b"]) -> Array:

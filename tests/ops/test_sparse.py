@@ -427,10 +427,9 @@ def test_to_dense_puts_each_site_in_its_place(shape):
     number, slots = 17, 30
     coordinates, features = random_coordinates(0, shape, number), random_features(1, slots)
     sites = sites_of(coordinates, shape, slots)
-    grid, pull_back = jax.vjp(
-        lambda rows: site_ops.to_dense(rows, sites, shape=shape), features.at[number:].set(jnp.nan)
-    )
-    scattered, pull_back_scattered = jax.vjp(lambda rows: sparse_dense.to_dense(rows, sites, shape=shape), features)
+    gather, scatter = (partial(module.to_dense, sites=sites, shape=shape) for module in (site_ops, sparse_dense))
+    grid, pull_back = jax.vjp(gather, features.at[number:].set(jnp.nan))
+    scattered, pull_back_scattered = jax.vjp(scatter, features)
     expected = np.zeros((*shape, features.shape[1]), np.float32)
     expected[tuple(coordinates.T)] = features[:number]
     np.testing.assert_array_equal(grid.transpose(2, 0, 1, 3), expected)
@@ -446,14 +445,14 @@ def test_lines_read_what_cells_read(shape):
     number = np.prod(shape) // 3
     sites = sites_of(random_coordinates(0, shape, number), shape, number)
     rng = np.random.default_rng(0)
-    z, y, x = (jnp.array(rng.integers(-4, n + 3, 500), jnp.int32) for n in shape)
+    z, y, x = (jnp.array(rng.integers(-4, n + 3, 2000), jnp.int32) for n in shape)
     for size in ((1, 1), (3, 3), (2, 2), (3, 1)):
         (slot, mask), (line_slot, line_mask) = (
             run_ops.runs_at(sites, z, y, x, size=size, program=program) for program in ("cpu", "accelerator")
         )
         np.testing.assert_array_equal(line_mask, mask)
         np.testing.assert_array_equal(np.where(mask != 0, line_slot, 0), np.where(mask != 0, slot, 0))
-        assert (mask != 0).sum() > 100
+        assert (mask != 0).sum() > 20
 
 
 def test_runs_name_the_sites_of_a_window():
