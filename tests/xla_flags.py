@@ -9,7 +9,7 @@ def xla_flags(devices: int, level: int | None = None) -> str:
     if level is not None:
         flags.append(f"--xla_backend_optimization_level={level}")
         # XLA aborts on a flag that it does not know.
-        if jaxlib.version.__version_info__ < (0, 12):
+        if jaxlib.version.__version_info__ < (0, 11):
             flags.append("--xla_cpu_use_fusion_emitters=false")
     if level == 0:
         flags.append("--xla_llvm_disable_expensive_passes=true")

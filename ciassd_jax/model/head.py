@@ -16,12 +16,11 @@ from ciassd_jax.types import Predictions
 
 
 class Branch(nn.Module):
-    """One convolution with a result of float32 or wider, whatever the compute type."""
+    """One convolution with an optional bias."""
 
     channels: int
     kernel_size: int
     use_bias: bool
-    dtype: jnp.dtype
     program: Program
 
     @nn.compact
@@ -30,15 +29,17 @@ class Branch(nn.Module):
         init = uniform_by_fan_in(size * size * inputs)
         kernel = self.param("kernel", init, (size, size, inputs, self.channels), jnp.float32)
         around = (size // 2, size // 2)
-        x = convolve_2d(x.astype(self.dtype), kernel.astype(self.dtype), (around, around), 1, self.program)
-        x = x.astype(jnp.promote_types(self.dtype, jnp.float32))
+        x = convolve_2d(x, kernel.astype(x.dtype), (around, around), 1, self.program)
         if self.use_bias:
             x = x + self.param("bias", init, (self.channels,), jnp.float32).reshape(1, 1, 1, -1)
         return x
 
 
 class MultiTaskHead(nn.Module):
-    """Three or four branches on the same features; one row per anchor in the order y, x, anchor of the cell."""
+    """Three or four branches on the same features; one row per anchor in the order y, x, anchor of the cell.
+
+    Computes in `dtype`, but at least in float32: bfloat16 would round the boxes themselves.
+    """
 
     config: HeadConfig
     anchors_per_cell: int
@@ -48,7 +49,8 @@ class MultiTaskHead(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "B H W C"]) -> Predictions:
         anchors, batch = self.anchors_per_cell, x.shape[0]
-        branch = partial(Branch, dtype=self.dtype, program=self.program)
+        x = x.astype(jnp.promote_types(self.dtype, jnp.float32))
+        branch = partial(Branch, program=self.program)
         box = branch(7 * anchors, 1, True, name="box")(x)
         class_logit = branch(anchors, 1, True, name="class")(x)
         direction = branch(2 * anchors, 1, True, name="direction")(x)

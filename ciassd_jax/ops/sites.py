@@ -164,13 +164,12 @@ def _list_sites(bits: UInt32[Array, "W Y X"], *, depth: int, capacity: int) -> t
     z = lax.optimization_barrier(_nth_bit([word[column_of] for word in bits], slot - start[column_of]))
     real = slot < found
     keys = jnp.where(real, column_of * depth + z, NO_SITE)
-    # Sites over capacity leave the map too; the last column that stays may lose only some of its own.
-    last = column_of[-1]
-    mine = real & (column_of == last)
-    trimmed = []
-    for i, word in enumerate(bits):
-        of_last = jnp.where(mine & (z >> 5 == i), _bit(z), 0).sum(dtype=jnp.uint32)
-        trimmed.append(jnp.where(start < capacity, jnp.where(column == last, of_last, word), 0))
+    # Sites over capacity leave the masks too; the column of the last slot may lose only some of its own.
+    kept = start < capacity
+    last = column == jnp.where(found > capacity, column_of[-1], -1)
+    trimmed = [
+        jnp.where(kept, jnp.where(last, word & lower_bits(z[-1] + 1 - 32 * i), word), 0) for i, word in enumerate(bits)
+    ]
     masks = jnp.stack(trimmed).reshape(words, height, width)
     count = jnp.minimum(found, capacity)
     return Sites(keys, count, masks, start.reshape(height, width)), found - count

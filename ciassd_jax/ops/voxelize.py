@@ -78,7 +78,6 @@ def voxelize(
     # A stable sort keeps the order of the cloud within a voxel.
     keys, order = lax.sort((keys, slots), num_keys=1, is_stable=True)
     is_first = (keys != jnp.concatenate([jnp.full(1, -1, jnp.int32), keys[:-1]])) & (keys != NO_SITE)
-    touched = is_first.sum(dtype=jnp.int32)
     limit = _first_over_capacity(is_first, order, max_voxels)
     kept = is_first & (order < limit)
     rank = jnp.cumsum(kept, dtype=jnp.int32)
@@ -91,9 +90,10 @@ def voxelize(
     total, number = _sums_of_runs(cloud.points[order], keys, usable, max_points)
     total, number, key, first_point = take_rows((total, number, keys, order), start)
     num_points = jnp.where(real, number, 0)
-    in_range = inside.sum(dtype=jnp.int32)
     # A point's voxel was kept if the last kept voxel that begins at or before it has its key.
     in_kept = usable & (count > 0) & (keys == key[jnp.maximum(rank - 1, 0)])
+    counted = jnp.stack([is_first, inside, given & ~finite, in_kept])
+    touched, in_range, not_finite, in_voxels = counted.sum(1, dtype=jnp.int32)
     return SparseVoxels(
         features=jnp.where(real[:, None], total, 0) / jnp.maximum(num_points, 1).astype(total.dtype)[:, None],
         coordinates=jnp.where(real[:, None], coordinates_of(key, shape), 0),
@@ -103,7 +103,7 @@ def voxelize(
         dropped=touched - count,
         points_given=jnp.asarray(cloud.count),
         points_in_range=in_range,
-        points_dropped=(given & ~finite).sum(dtype=jnp.int32) + in_range - in_kept.sum(dtype=jnp.int32),
+        points_dropped=not_finite + in_range - in_voxels,
     )
 
 

@@ -102,6 +102,7 @@ def test_an_empty_batch_is_finite_and_changes_nothing():
     jax.tree.map(np.testing.assert_array_equal, updated["batch_stats"], variables["batch_stats"])
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("second_device", [0.1, 0.0])
 def test_two_devices_pool_their_entries(second_device):
     """Of unequal counts, one perhaps empty: value, running statistics and gradients of one device."""

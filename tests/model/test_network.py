@@ -98,6 +98,7 @@ def test_parameter_shapes_of_the_car():
     assert jax.tree.map(jnp.shape, released["head"]["iou"]) == {"kernel": (3, 3, 128, 2)}
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("seed", [0, 1])
 def test_predictions_are_those_of_the_definition(variables, seed):
     """Voxels, sparse convolutions, neck and head of made-up points, computed by loops in float64."""
@@ -276,6 +277,7 @@ def test_the_car_never_holds_a_dense_grid(car_equations):
         assert not sizes & {cells * channels for channels in (1, 3, 4, 16, 27, 32, 64)}, grid
 
 
+@pytest.mark.smoke
 def test_every_product_asks_for_full_precision(car_equations):
     """Accelerators would otherwise use TF32 or bfloat16."""
     products = [e for e in car_equations if e.primitive.name in ("dot_general", "conv_general_dilated")]

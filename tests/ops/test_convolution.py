@@ -19,6 +19,11 @@ def convolve_by_xla(x: jax.Array, kernel: jax.Array, padding, stride: int) -> ja
     )
 
 
+programs = pytest.mark.parametrize("program", ["auto", "accelerator"])
+
+
+@pytest.mark.smoke
+@programs
 @pytest.mark.parametrize(
     ("shape", "size", "padding", "stride"),
     [
@@ -31,18 +36,18 @@ def convolve_by_xla(x: jax.Array, kernel: jax.Array, padding, stride: int) -> ja
         ((1, 50, 40, 2), (3, 3), ((1, 1), (1, 1)), 1),
     ],
 )
-def test_value_and_gradients_are_xlas(shape, size, padding, stride):
+def test_value_and_gradients_are_xlas(shape, size, padding, stride, program):
     """Rows of which one, several, or all fit into a block; odd and even sizes with a stride."""
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
         x, kernel = jnp.array(rng.normal(size=shape)), jnp.array(rng.normal(size=(*size, shape[-1], 4)))
 
-        def run(function):
-            loss = lambda *arrays: jnp.sin(function(*arrays, padding, stride)).sum()  # noqa: E731
+        def run(function, *settings):
+            loss = lambda *arrays: jnp.sin(function(*arrays, padding, stride, *settings)).sum()  # noqa: E731
             return jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(x, kernel)
 
         close = partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-10)
-        jax.tree.map(close, run(convolve_2d), run(convolve_by_xla))
+        jax.tree.map(close, run(convolve_2d, program), run(convolve_by_xla))
 
 
 def test_gradient_of_bfloat16_is_accumulated_in_float32():
@@ -65,14 +70,16 @@ def upsample_by_dilation(x: jax.Array, kernel: jax.Array) -> jax.Array:
     )
 
 
+@programs
 @pytest.mark.parametrize("shape", [(2, 3, 4, 5), (1, 1, 1, 2), (1, 5, 2, 3)])
-def test_upsample_is_the_transposed_convolution(shape):
+def test_upsample_is_the_transposed_convolution(shape, program):
     rng = np.random.default_rng(0)
     x, kernel = rng.normal(size=shape), rng.normal(size=(3, 3, shape[-1], 4))
     arrays = jnp.float32(x), jnp.float32(kernel)
-    np.testing.assert_allclose(upsample_2d(*arrays), upsample_loop(x, kernel), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(upsample_2d(*arrays, program), upsample_loop(x, kernel), rtol=0, atol=1e-5)
 
-    def run(function):
-        return jax.jit(jax.value_and_grad(lambda *a: jnp.sin(function(*a)).sum(), argnums=(0, 1)))(*arrays)
+    def run(function, *settings):
+        return jax.jit(jax.value_and_grad(lambda *a: jnp.sin(function(*a, *settings)).sum(), argnums=(0, 1)))(*arrays)
 
-    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5), run(upsample_2d), run(upsample_by_dilation))
+    close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5)
+    jax.tree.map(close, run(upsample_2d, program), run(upsample_by_dilation))

@@ -167,6 +167,7 @@ def selection(candidates: Candidates, clusters: Clusters) -> tuple[np.ndarray, n
 # Greedy suppression and pairwise overlap
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("density", [0.003, 0.02, 0.1, 0.5])
 def test_fixed_point_is_the_greedy_loop(density):
     rng = np.random.default_rng(0)
@@ -320,6 +321,7 @@ def test_the_scenes_are_hard(scenes):
         assert sum(min(c.members) < c.candidate for _, c in supported) > 20
 
 
+@pytest.mark.smoke
 def test_the_same_clusters_as_the_loop(scenes, results):
     name, _, _, loops = scenes
     for (numbers, boxes, scores), clusters in zip(results, loops, strict=True):

@@ -41,6 +41,7 @@ def test_value_and_gradients_are_those_of_the_definition(share):
         )
 
 
+@pytest.mark.smoke
 def test_shards_pool_value_and_gradient():
     """Four shards with unequal numbers of real entries, one without any, are as one."""
     rng = np.random.default_rng(1)

@@ -148,7 +148,7 @@ GRIDS = {
 }
 
 
-@pytest.mark.parametrize("occupied", [0.0, 0.002, 0.05, 0.4, 1.0])
+@pytest.mark.parametrize("occupied", [0.0, 0.002, pytest.param(0.05, marks=pytest.mark.smoke), 0.4, 1.0])
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("grid", GRIDS)
 def test_gathered_equals_dense(grid, form, occupied):

@@ -151,6 +151,7 @@ def test_order_of_points_is_irrelevant_while_nothing_is_capped():
         np.testing.assert_allclose(other.features, voxels.features, rtol=0, atol=1e-5)
 
 
+@pytest.mark.smoke
 def test_scenes_under_vmap_are_scenes_alone():
     clouds = [padded(random_points(4, number, spread=0.9)) for number in (0, 1, 77, ROWS)]
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *clouds)
