@@ -19,10 +19,12 @@ from ciassd_jax.ops.nms import (
     released_di_nms,
     rotated_nms,
 )
+from ciassd_jax.ops.platform import Program
 from ciassd_jax.types import Boxes, Candidates
 
 SETTINGS = {"overlap": 0.3, "sigma_squared": (0.0009, 0.009, 0.1, 1.0), "distances": (20.0, 40.0, 60.0)}
 SLOTS = 64
+PROGRAMS = ("auto", "accelerator")
 
 
 class Scene(NamedTuple):
@@ -138,12 +140,12 @@ def to_candidates(scene: Scene, slots: int = SLOTS) -> tuple[Candidates, np.ndar
     return jax.tree.map(jnp.asarray, candidates), jnp.asarray(pad(scene.support_threshold, 0.0))
 
 
-@partial(jax.jit, static_argnames=("overlap",))
+@partial(jax.jit, static_argnames=("overlap", "program"))
 def run_released(candidates: Candidates, threshold: jax.Array, **settings) -> tuple[Candidates, Clusters]:
     return candidates, released_di_nms(candidates, support_threshold=threshold, **(SETTINGS | settings))
 
 
-@partial(jax.jit, static_argnames=("overlap",))
+@partial(jax.jit, static_argnames=("overlap", "program"))
 def run_paper(candidates: Candidates, threshold: jax.Array, **settings) -> tuple[Candidates, Clusters]:
     """In order of S; the thresholds follow their candidates."""
     candidates = refine_by_anchor_distance(candidates)
@@ -151,6 +153,7 @@ def run_paper(candidates: Candidates, threshold: jax.Array, **settings) -> tuple
     return candidates, paper_di_nms(candidates, support_threshold=threshold, **(SETTINGS | settings))
 
 
+RUNS = [partial(run, program=program) for run in (run_released, run_paper) for program in PROGRAMS]
 VARIANTS = {
     "released": (run_released, released_di_nms_loop, (-0.05, 1.1)),
     "paper": (run_paper, paper_di_nms_loop, (0.01, 1.0)),
@@ -200,8 +203,9 @@ def test_greedy_keeps_nothing_of_nothing():
     np.testing.assert_array_equal(greedy_keep(jnp.ones((5, 5), bool), jnp.ones(5, bool)), np.arange(5) == 0)
 
 
+@pytest.mark.parametrize("program", PROGRAMS)
 @pytest.mark.parametrize("slots", [1, 127, 128, 129, 300])
-def test_pairwise_overlap_across_blocks(slots):
+def test_pairwise_overlap_across_blocks(slots, program):
     rng = np.random.default_rng(slots)
     boxes = np.zeros((slots, 7), np.float32)
     # Dense enough that boxes of every pair of tiles overlap.
@@ -210,7 +214,7 @@ def test_pairwise_overlap_across_blocks(slots):
     boxes[:, 6] = rng.uniform(-4, 4, slots)
     wide = Boxes.from_array(boxes.astype(np.float64))
     direct = iou_bev(jax.tree.map(lambda leaf: leaf[:, None], wide), jax.tree.map(lambda leaf: leaf[None], wide))
-    pairwise = jax.jit(pairwise_iou)
+    pairwise = jax.jit(partial(pairwise_iou, program=program))
     for count in {0, 1, slots // 2, max(slots - 1, 0), slots}:
         garbage = boxes.copy()
         garbage[count:] = np.nan
@@ -250,25 +254,28 @@ def chosen(clusters: Clusters) -> list[int]:
     return np.flatnonzero(clusters.selected).tolist()
 
 
-@jax.jit
-def rotated(candidates: Candidates) -> dict[str, Clusters]:
+@partial(jax.jit, static_argnames="program")
+def rotated(candidates: Candidates, program: Program) -> dict[str, Clusters]:
+    run = partial(rotated_nms, candidates, program=program)
     return {
-        "at 1/2": rotated_nms(candidates, overlap=0.5),
-        "above 1/2": rotated_nms(candidates, overlap=0.50001),
-        "first three": rotated_nms(candidates, overlap=0.5, limit=3),
-        "none": rotated_nms(candidates, overlap=0.5, limit=0),
+        "at 1/2": run(overlap=0.5),
+        "above 1/2": run(overlap=0.50001),
+        "first three": run(overlap=0.5, limit=3),
+        "none": run(overlap=0.5, limit=0),
     }
 
 
-def test_rotated_nms_suppresses_at_the_limit_itself():
-    found = rotated(row_of_candidates([10, 11, 13.5]))
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_rotated_nms_suppresses_at_the_limit_itself(program):
+    found = rotated(row_of_candidates([10, 11, 13.5]), program)
     assert chosen(found["at 1/2"]) == [0, 2]
     assert chosen(found["above 1/2"]) == [0, 1, 2]
 
 
-def test_rotated_nms_knows_classes_padding_and_a_limit():
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_rotated_nms_knows_classes_padding_and_a_limit(program):
     candidates = row_of_candidates([10, 10, 10, 20, 30], [0, 1, 0, 0, 0])
-    found = rotated(candidates)
+    found = rotated(candidates, program)
     assert chosen(found["at 1/2"]) == [0, 1, 3, 4]
     assert chosen(found["first three"]) == [0, 1, 3]
     assert chosen(found["none"]) == []
@@ -288,13 +295,13 @@ def scenes(request):
     return request.param, run, drawn, [scene.by_loop(loop) for scene in drawn]
 
 
-@pytest.fixture(scope="module")
-def results(scenes):
+@pytest.fixture(scope="module", params=PROGRAMS)
+def results(scenes, request):
     """What the parallel code makes of them, all scenes at once."""
     _, run, drawn, _ = scenes
     padded = [to_candidates(scene) for scene in drawn]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
-    found = jax.vmap(run)(*batch)
+    found = jax.vmap(partial(run, program=request.param))(*batch)
     return [selection(*jax.tree.map(lambda leaf, i=i: leaf[i], found)) for i in range(len(drawn))]
 
 
@@ -454,7 +461,7 @@ def test_refined_score_orders_the_candidates():
     assert refined.valid.tolist() == [True] * 3 + [False] * 4
 
 
-@pytest.mark.parametrize("run", [run_released, run_paper])
+@pytest.mark.parametrize("run", RUNS)
 def test_far_anchors_do_not_overflow(run):
     """The softmax of 20 m squared overflows float32 unless it is shifted."""
     candidates = row_of_candidates([10, 10, 10, 30, 30, 30])
@@ -466,7 +473,7 @@ def test_far_anchors_do_not_overflow(run):
     assert (scores > 0.5).all()
 
 
-@pytest.mark.parametrize("run", [run_released, run_paper])
+@pytest.mark.parametrize("run", RUNS)
 def test_no_candidate_gives_no_cluster(run):
     candidates = row_of_candidates([])
     candidates = candidates._replace(score=jnp.full(ROW, np.nan), anchor_distance=jnp.full(ROW, np.nan))
@@ -475,7 +482,7 @@ def test_no_candidate_gives_no_cluster(run):
     assert np.isfinite(clusters.boxes.to_array()).all()
 
 
-@pytest.mark.parametrize("run", [run_released, run_paper])
+@pytest.mark.parametrize("run", RUNS)
 def test_a_candidate_that_overflowed_spoils_no_other(run):
     """A real candidate whose size or angle is no number overlaps nothing and is not selected."""
     x = [10.0, 10, 10, 30, 30, 30]
