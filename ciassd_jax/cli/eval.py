@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
-from ciassd_jax.cli.options import Frames, Preset, Unset, load_as, override
+from ciassd_jax.cli.options import Dtype, Frames, Preset, Unset, load_as, override
 from ciassd_jax.evaluation import Evaluation, evaluate, format_json, format_report, read_folders
 from ciassd_jax.formats.writing import check_folder, write_text
 from ciassd_jax.inference.detector import Detector
@@ -64,6 +64,8 @@ class Evaluate:
     """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
     preset: Unset[Preset] = None
     """Use the config of this preset instead of the one in the weights file; the parameters must fit."""
+    dtype: Unset[Dtype] = None
+    """Compute type of the network; by default that of the weights."""
     score_threshold: Unset[float] = None
     """Lowest class probability of a candidate."""
     files: Annotated[
@@ -80,7 +82,7 @@ class Evaluate:
 
     def _network(self) -> int:
         weights = load_as(self._weights(), self.preset)
-        config = override(weights.config, score_threshold=self.score_threshold)
+        config = override(weights.config, dtype=self.dtype, score_threshold=self.score_threshold)
         folder = self.data_set.find_folder()
         for out in (self.out, self.json and self.json.parent):
             if out is not None:

@@ -6,6 +6,8 @@ three offsets of a kernel. Packed into one integer it is 8 * slot + mask; withou
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,15 +37,9 @@ def runs_at(
     Columns may lie outside of the grid. The slot of a run without sites means nothing.
     """
     assert sites.masks is not None, "sites of the dense backend have no maps"
-    maps = [*lax.bitcast_convert_type(sites.masks, jnp.int32), sites.starts]
-    *words, start = by_platform(
-        program,
-        jnp.stack(maps),
-        y,
-        x,
-        cpu=lambda maps, y, x: _read_cells(maps, y, x, size),
-        accelerator=lambda maps, y, x: _read_lines(maps, y, x, size),
-    )
+    maps = (*lax.bitcast_convert_type(sites.masks, jnp.int32), sites.starts)
+    cells, lines = partial(_read_cells, size=size), partial(_read_lines, size=size)
+    *words, start = by_platform(program, maps, y, x, cpu=cells, gpu=cells, accelerator=lines)
     slot, mask = start, jnp.zeros_like(start)
     for i, word in enumerate(words):
         bits, shift = lax.bitcast_convert_type(word, jnp.uint32), (z - 32 * i)[None, None]
@@ -64,26 +60,26 @@ def _within(index: Int[Array, "*n"], size: int) -> Bool[Array, "*n"]:
 
 
 def _read_cells(
-    maps: Int[Array, "M Y X"], y: Int[Array, " V"], x: Int[Array, " V"], size: tuple[int, int]
-) -> Int[Array, "M KY KX V"]:
-    """Read every column of every map for itself; 0 outside of the maps."""
-    _, height, width = maps.shape
+    maps: tuple[Array, ...], y: Int[Array, " V"], x: Int[Array, " V"], size: tuple[int, int]
+) -> list[Int[Array, "KY KX V"]]:
+    """Read every column of every map [Y, X] for itself; 0 outside of the maps."""
+    height, width = maps[0].shape
     rows, columns = (n[None] + jnp.arange(k, dtype=jnp.int32)[:, None] for n, k in zip((y, x), size, strict=True))
     inside = _within(rows, height)[:, None] & _within(columns, width)[None]
     place = jnp.where(inside, rows[:, None] * width + columns[None], 0)
-    flat = jnp.asarray(maps).reshape(len(maps), -1)
-    return jnp.stack([jnp.where(inside, one.at[place].get(mode="promise_in_bounds"), 0) for one in flat])
+    read = (jnp.asarray(one).reshape(-1).at[place].get(mode="promise_in_bounds") for one in maps)
+    return [jnp.where(inside, values, 0) for values in read]
 
 
 def _read_lines(
-    maps: Int[Array, "M Y X"], y: Int[Array, " V"], x: Int[Array, " V"], size: tuple[int, int]
-) -> Int[Array, "M KY KX V"]:
+    maps: tuple[Array, ...], y: Int[Array, " V"], x: Int[Array, " V"], size: tuple[int, int]
+) -> list[Int[Array, "KY KX V"]]:
     """Read a row of columns of all maps at once: on a TPU the number of reads counts, not their width.
 
     A line holds the same stretch of x of every map, side by side. Lines overlap, so that one of them holds the whole
     window.
     """
-    count, height, width = maps.shape
+    count, (height, width) = len(maps), maps[0].shape
     more = size[1] - 1
     cells = max(_LANES // count, size[1])
     step = cells - more
@@ -107,7 +103,7 @@ def _read_lines(
         value = jnp.where(lane == offset + (number * cells + column), read, 0).sum(1, dtype=jnp.int32)
         return jnp.where(inside, value, 0).reshape(size[0], -1)
 
-    return jnp.stack([jnp.stack([cell(number, column) for column in range(size[1])], 1) for number in range(count)])
+    return [jnp.stack([cell(number, column) for column in range(size[1])], 1) for number in range(count)]
 
 
 def followers(sites: Sites, *, depth: int, step: int = 1) -> Int[jax.Array, " V"]:

@@ -12,7 +12,7 @@ import pytest
 from mini_folders import NAMES, write_custom, write_kitti, write_split
 from small import random_variables, small_config
 
-from ciassd_jax import save_weights
+from ciassd_jax import Config, Detector, save_weights
 from ciassd_jax.cli import main
 from ciassd_jax.evaluation import evaluate, read_folders, to_json
 from ciassd_jax.formats.kitti_rows import ObjectRow, write_rows
@@ -135,6 +135,19 @@ def test_the_weights_of_a_training_and_the_environments_data(
     shown, _ = capsys.readouterr()
     assert "No camera: difficulty is by the number of points" in shown
     assert json.loads(out.read_text())["Car"]["3d"]["R40"]["0.70"] is not None
+
+
+def test_dtype_overrides_that_of_the_weights(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = []
+
+    def make_detector(variables: Any, config: Config) -> Detector:
+        given.append(config.dtype)
+        return Detector(variables, small_config())
+
+    monkeypatch.setattr("ciassd_jax.cli.eval.Detector", make_detector)
+    arguments = ["eval", "--workdir", str(work / "run"), "--data", str(work / "kitti")]
+    assert main([*arguments, "--dtype", "bfloat16"]) == main(arguments) == 0
+    assert given == ["bfloat16", "float32"]
 
 
 def test_simulated_frames_need_no_folder(
