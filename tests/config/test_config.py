@@ -201,6 +201,7 @@ def edited(path: str, value: object) -> str:
         ("classes.0.name", 5, r"config\.classes\[0\]\.name: expected str, not 5"),
         ("backbone.stages.1.layers", "two", r"config\.backbone\.stages\[1\]\.layers: expected int, not 'two'"),
         ("dtype", "float16", r"config\.dtype: 'float16' is not one of \['float32', 'bfloat16', 'float64'\]"),
+        ("program", "tpu", r"config\.program: 'tpu' is not one of \['auto', 'cpu', 'accelerator'\]"),
         ("detection.nms", ["paper"], r"config\.detection\.nms: \['paper'\] is not one of"),
         # Equal to 1 and to 3 in Python, but no kernel sizes.
         ("neck.attention_kernel", True, r"config\.neck\.attention_kernel: True is not one of \[1, 3\]"),
@@ -226,7 +227,7 @@ def test_json_that_is_not_a_config_is_refused(text):
         Config.from_json(text)
 
 
-@pytest.mark.parametrize("path", ["detection", "neck.channels", "schedule.remat", "dtype"])
+@pytest.mark.parametrize("path", ["detection", "neck.channels", "schedule.remat", "dtype", "program"])
 def test_a_missing_field_has_its_default(path):
     assert Config.from_json(edited(path, ...)) == car()
 
@@ -283,6 +284,7 @@ def test_for_inference_keeps_what_predict_reads():
         replace(config, classes=(replace(config.classes[0], center_z=0.0), *config.classes[1:])),
         replace(config, grid=replace(config.grid, max_voxels=30000)),
         replace(config, dtype="bfloat16"),
+        replace(config, program="accelerator"),
     ):
         assert changed.for_inference() != config.for_inference()
 
@@ -355,6 +357,7 @@ def test_a_config_needs_no_static_argnames():
         (Config, {"classes": ()}, "classes: give at least one"),
         (Config, {"classes": (ClassConfig(), ClassConfig())}, "classes: .*each with its own name"),
         (Config, {"dtype": "float16"}, "dtype: 'float16' is unknown; choose 'float32', 'bfloat16' or 'float64'"),
+        (Config, {"program": "gpu"}, "program: 'gpu' is unknown; choose 'auto', 'cpu' or 'accelerator'"),
         (Config, {"grid": GridConfig(maximum=(70.0, 40.0, 1.0))}, r"grid\.x: 1400 voxels .* 1392 or 1408\."),
         (Config, {"grid": GridConfig(maximum=(70.4, 39.8, 1.0))}, r"grid\.y: 1596 voxels .* 1584 or 1600\."),
         (Config, {"grid": GridConfig(maximum=(0.4, 40.0, 1.0))}, r"grid\.x: 8 voxels .* count is 16\."),
