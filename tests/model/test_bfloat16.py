@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -96,12 +97,14 @@ def test_a_step_is_near_that_in_float32():
 
     def run(dtype):
         after, metrics = jax.jit(train_step)(state, scenes(config), replace(config, dtype=dtype))
-        return jax.device_get((metrics, after.optimizer[1].inner_state.mu))
+        return jax.device_get((metrics, after))
 
-    (exact, gradient), (near, rounded) = run("float32"), run("bfloat16")
+    (exact, expected), (near, after) = run("float32"), run("bfloat16")
+    chex.assert_trees_all_equal_shapes_and_dtypes((near, after), (exact, expected))
     assert near["positives"] == exact["positives"] > 0
     for name in ("classification", "box", "direction", "iou", "loss"):
         np.testing.assert_allclose(near[name], exact[name], rtol=5e-3, err_msg=name)
         assert near[name] != exact[name]
     np.testing.assert_allclose(near["gradient_norm"], exact["gradient_norm"], rtol=0.03)
+    gradient, rounded = (state.optimizer[1].inner_state.mu for state in (expected, after))
     assert np.vdot(gradient, rounded) > 0.95 * np.linalg.norm(gradient) * np.linalg.norm(rounded)

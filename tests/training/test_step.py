@@ -224,17 +224,6 @@ def test_rematerialised_gradients_are_the_same():
 
 
 @pytest.mark.slow
-def test_bfloat16_keeps_parameters_and_statistics_in_float32():
-    config = replace(short(), dtype="bfloat16")
-    state, metrics = step(fresh(config), batch(), config)
-    exact, expected = step(fresh(short()), batch(), short())
-    assert {leaf.dtype for leaf in jax.tree.leaves((state.params, state.batch_stats))} == {jnp.dtype("float32")}
-    assert all(value.dtype in (jnp.float32, jnp.int32) for value in metrics.values())
-    assert float(metrics["loss"]) == pytest.approx(float(expected["loss"]), rel=0.05)
-    assert jax.tree.structure(state) == jax.tree.structure(exact)
-
-
-@pytest.mark.slow
 def test_several_devices_make_the_same_update():
     """Gradients to 1e-6 relative and parameters to 1e-5, in float64; pooled statistics and metrics too.
 
