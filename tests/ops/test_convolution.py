@@ -54,7 +54,8 @@ def test_value_and_gradients_are_xlas(shape, size, padding, stride, program):
 def test_gradient_of_bfloat16_is_accumulated_in_float32(program):
     """Ten thousand cells of 1: a bfloat16 sum would stand still at 256."""
     x, kernel = jnp.ones((1, 100, 100, 1), jnp.bfloat16), jnp.ones((1, 1, 1, 1), jnp.bfloat16)
-    gradient = jax.grad(lambda kernel: convolve_2d(x, kernel, ((0, 0), (0, 0)), 1, program).astype(jnp.float32).sum())(kernel)
+    convolve = partial(convolve_2d, padding=((0, 0), (0, 0)), program=program)
+    gradient = jax.grad(lambda kernel: convolve(x, kernel).astype(jnp.float32).sum())(kernel)
     assert gradient.dtype == jnp.bfloat16
     np.testing.assert_allclose(np.float32(gradient), 1e4, rtol=1e-2)
 
