@@ -1,7 +1,6 @@
 """The accelerators' form of the whole network, on the CPU, beside the CPU's own."""
 
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import chex
@@ -28,7 +27,6 @@ def config_of(program: str) -> Config:
     )
 
 
-@cache
 def scenes() -> Scene:
     """A sparse, an empty and a crowded one."""
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(random_scene(tiny(), seed) for seed in range(3)))
@@ -38,13 +36,13 @@ def scenes() -> Scene:
 @pytest.fixture(scope="module")
 def results() -> dict[str, Any]:
     """Detections, and the state and metrics after a step, of both forms; of the accelerators' twice."""
-    variables = random_variables(tiny())
+    variables, batch = random_variables(tiny()), scenes()
     state = create_train_state(jax.random.key(0), tiny(), variables=variables)
     infer, step = jax.jit(predict), jax.jit(train_step)
 
     def run(program: str) -> Any:
         config = config_of(program)
-        return jax.device_get((infer(variables, scenes().cloud, config), step(state, scenes(), config)))
+        return jax.device_get((infer(variables, batch.cloud, config), step(state, batch, config)))
 
     return {"cpu": run("cpu"), "accelerator": run("accelerator"), "again": run("accelerator")}
 
