@@ -181,7 +181,7 @@ def test_prediction_uses_the_moving_average_of_the_parameters():
     start = fresh(config)
     state, _ = step(start, batch(), config)
     expected = jax.tree.map(lambda old, new: (old + new) / 2, start.params, state.params)
-    chex.assert_trees_all_close(state.ema, expected, rtol=1e-6)
+    chex.assert_trees_all_close(state.ema, expected, rtol=1e-6, atol=1e-9)
     chex.assert_trees_all_equal(variables_of(state)["params"], state.ema)
     plain = fresh(short(ema_decay=0.0))
     assert plain.ema is None
