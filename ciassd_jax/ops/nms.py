@@ -39,7 +39,8 @@ def pairwise_iou(boxes: Boxes, count: Int[Array, ""], program: Program = "auto")
 
 def _pairs_at_once(boxes: Boxes, count: Int[Array, ""]) -> Float[Array, "K K"]:
     rows, columns = (jax.tree.map(partial(jnp.expand_dims, axis=axis), boxes) for axis in (1, 0))
-    return iou_bev(rows, columns)
+    # Each consumer would compute the overlaps again, and compile them.
+    return lax.optimization_barrier(iou_bev(rows, columns))
 
 
 @jax.custom_batching.sequential_vmap

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -24,28 +25,27 @@ def voxel_coordinates(
     Exactly floor((p - minimum) / size) in float32. KITTI's coordinates are whole millimetres and often lie on a cell
     border, where a multiplication by the reciprocal would move them to the neighbouring cell.
     """
-    offset = points.astype(jnp.float32) - jnp.array(minimum, jnp.float32)[None]
-    index = jnp.stack([_floor_of_quotient(offset[:, axis], size) for axis, size in enumerate(voxel_size)], -1)
-    inside = ((index >= 0) & (index < jnp.array(cells, jnp.float32)[None])).all(-1)
-    return jnp.where(inside[:, None], index, 0).astype(jnp.int32)[:, ::-1], inside
+    offset = points.astype(jnp.float32).T - jnp.array(minimum, jnp.float32)[:, None]
+    index = _floor_of_quotient(offset, np.array(voxel_size, np.float32)[:, None])
+    inside = ((index >= 0) & (index < jnp.array(cells, jnp.float32)[:, None])).all(0)
+    return jnp.where(inside[None], index, 0).astype(jnp.int32).T[:, ::-1], inside
 
 
-def _floor_of_quotient(values: Float[Array, " P"], divisor: float) -> Float[Array, " P"]:
+def _floor_of_quotient(values: Float[Array, "*n"], divisor: np.ndarray | np.float32) -> Float[jax.Array, "*n"]:
     """Return floor(values / divisor) of IEEE 754 division, exact for results of 0 to 2**16.
 
     Compilers replace a division by a constant with a product, and accelerators approximate it. Here the quotient only
     proposes the nearest whole number n. Whether the rounded quotient reaches n is decided by n * divisor - values,
     every step of which is exact.
     """
-    size = np.float32(divisor)
-    nearest = jnp.round(values / size)
+    nearest = jnp.round(values / divisor)
     # Half the distance from n to the float below: a quotient this close is rounded up to n.
-    slack = (nearest - jnp.nextafter(nearest, jnp.zeros_like(nearest))) / 2 * size
-    missing, rest = -values, size
+    slack = (nearest - jnp.nextafter(nearest, jnp.zeros_like(nearest))) / 2 * divisor
+    missing, rest = -values, divisor
     for _ in range(3):
         # Eight bits of the divisor at a time: their product with n needs no rounding.
         exponent = np.frexp(rest)[1] - 8
-        part = np.float32(np.ldexp(np.trunc(np.ldexp(rest, -exponent)), exponent))
+        part = np.ldexp(np.trunc(np.ldexp(rest, -exponent)), exponent)
         missing = missing + nearest * part
         rest = rest - part
     return jnp.where(missing <= slack, nearest, nearest - 1)

@@ -202,7 +202,7 @@ def test_the_nearest_floats_to_a_border_fall_on_their_side(size, seed):
         values = np.nextafter(values, values + rng.integers(-1, 2, 4000)).astype(np.float32)
     values[:1000] = np.round(rng.uniform(0, 70, 1000), 3)
     expected = np.floor(values / np.float32(size))
-    np.testing.assert_array_equal(floor_of_quotient(values, size), expected)
+    np.testing.assert_array_equal(floor_of_quotient(values, np.float32(size)), expected)
 
 
 def test_range_is_half_open():
