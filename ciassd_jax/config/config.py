@@ -34,8 +34,8 @@ class Config:
     detection: DetectionConfig = field(default_factory=DetectionConfig)
     data: DataConfig = field(default_factory=DataConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    # Type of the convolutions; parameters, BatchNorm, the head, coordinates, IoU and NMS stay float32. "float64" serves exact
-    # comparisons and needs `jax_enable_x64`.
+    # Type of the convolutions; parameters, BatchNorm, the head, coordinates, IoU and NMS stay float32. "float64" serves
+    # exact comparisons and needs `jax_enable_x64`.
     dtype: Literal["float32", "bfloat16", "float64"] = "float32"
     # Form of the computations that a CPU and an accelerator do differently: "auto" chooses by the platform that is
     # compiled for. "accelerator" runs on a CPU too, slowly.

@@ -1,4 +1,4 @@
-"""Rows of many arrays, taken together."""
+"""Rows of arrays: of many taken together, and those that follow each row."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Int
 
 from ciassd_jax.types import Array
@@ -30,3 +31,8 @@ def take_rows(tree: Tree, index: Int[Array, " K"]) -> Tree:
             taken[i] = part.reshape(len(index), *arrays[i].shape[1:]).astype(arrays[i].dtype)
             first += column.shape[1]
     return jax.tree.unflatten(structure, [taken[i] for i in range(len(arrays))])
+
+
+def rows_ahead(array: Array, k: int, fill: int | np.integer) -> jax.Array:
+    """For each row the one k places after it; rows of `fill` after the end."""
+    return jnp.concatenate([array[k:], jnp.full_like(array[:k], fill)])

@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Bool, Float, Int, UInt32
 
 from ciassd_jax.ops.platform import Program, by_platform
+from ciassd_jax.ops.rows import rows_ahead
 from ciassd_jax.ops.sites import NO_SITE, lower_bits
 from ciassd_jax.types import Array, Sites
 
@@ -111,7 +112,7 @@ def followers(sites: Sites, *, depth: int, step: int = 1) -> Int[jax.Array, " V"
     keys = jnp.asarray(sites.keys)
     real = keys != NO_SITE
     z = lax.rem(keys, np.int32(depth))
-    ahead = [jnp.concatenate([keys[k:], jnp.full(min(k, len(keys)), NO_SITE)]) - keys for k in (1, 2)]
+    ahead = [rows_ahead(keys, k, NO_SITE) - keys for k in (1, 2)]
     next_one = real & (ahead[0] == 1) & (z + 1 < depth)
     next_but_one = real & ((ahead[0] == 2) | (ahead[1] == 2)) & (z + 2 < depth)
     if step == 2:
@@ -138,7 +139,7 @@ def windows(rows: Float[Array, "N C"], following: Int[Array, " N"]) -> Float[jax
     a matrix it would read eight, the height of its tiles. `following` are the `followers` of the rows.
     """
     second, third = following & 2 != 0, following & 4 != 0
-    ahead = [jnp.pad(rows[k:], ((0, min(k, len(rows))), (0, 0))) for k in (1, 2)]
+    ahead = [rows_ahead(rows, k, 0) for k in (1, 2)]
     own = jnp.where((following & 1 != 0)[:, None], rows, 0)
     next_one = jnp.where(second[:, None], ahead[0], 0)
     next_but_one = jnp.where(third[:, None], jnp.where(second[:, None], ahead[1], ahead[0]), 0)

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
-from ciassd_jax.ops.rows import take_rows
+from ciassd_jax.ops.rows import rows_ahead, take_rows
 from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of, linear_keys
 from ciassd_jax.types import Array, PointCloud, SparseVoxels
 
@@ -122,8 +122,7 @@ def _sums_of_runs(
     """For each point of the sorted list, sum and number of it and up to `most` - 1 further ones of the same key."""
     total, number = jnp.zeros_like(points), jnp.zeros(len(keys), jnp.int32)
     for k in range(most):
-        ahead = lambda array, fill, k=k: jnp.concatenate([array[k:], jnp.full_like(array[:k], fill)])  # noqa: E731
-        mine = (ahead(keys, NO_SITE) == keys) & ahead(usable, False)
-        total += jnp.where(mine[:, None], ahead(points, 0), 0)
+        mine = (rows_ahead(keys, k, NO_SITE) == keys) & rows_ahead(usable, k, False)
+        total += jnp.where(mine[:, None], rows_ahead(points, k, 0), 0)
         number += mine
     return total, number
