@@ -7,15 +7,15 @@
 JAX compiles ahead of time for a device that is only described. This is no measurement of speed: it says what compiles,
 in which time and memory, and what would be slow: loops of unknown length and conditionals (a GPU's host reads a value
 back each time round), counted loops and many kernels (each a launch of microseconds), and for the TPU the compiler's
-own estimate. That estimate can be negative for a large program, because the cost of some operations is unknown to the
-compiler; so it is summed over parts. Needs Python 3.12 and `pip install -e '.[accelerators]'`. libtpu allows one
-process at a time.
+own estimate. The compiler counts an operation of unknown cost as minus one second: the report adds these back and says
+how many there are. Needs Python 3.12 and `pip install -e '.[accelerators]'`. libtpu allows one process at a time.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import re
 import sys
@@ -84,13 +84,17 @@ class TooLargeError(Exception):
 
 
 class Compiled(NamedTuple):
-    """Seconds to trace and lower and to compile, bytes on each device, the compiler's estimate, and what is in it."""
+    """Seconds to trace and lower and to compile, bytes on each device, the compiler's estimate, and what is in it.
+
+    `of_unknown_cost` operations are not in the estimate.
+    """
 
     lower_s: float
     compile_s: float
     temporary: int
     memory: int
     estimate_ms: float | None
+    of_unknown_cost: int
     summary: Summary
 
 
@@ -110,9 +114,11 @@ def compile_for(target: str, program: Any, arguments: Sequence[Any]) -> Compiled
     memory, cost = compiled.memory_analysis(), compiled.cost_analysis() or {}
     kept = memory.argument_size_in_bytes + memory.output_size_in_bytes - memory.alias_size_in_bytes
     temporary = memory.temp_size_in_bytes
-    estimate = 1e3 * cost["optimal_seconds"] if "optimal_seconds" in cost else None
+    seconds = cost.get("optimal_seconds")
+    unknown = max(0, math.ceil(-(seconds or 0)))
+    estimate = None if seconds is None else 1e3 * (seconds + unknown)
     summary = summarise(compiled.as_text())
-    return Compiled(middle - start, end - middle, temporary, kept + temporary, estimate, summary)
+    return Compiled(middle - start, end - middle, temporary, kept + temporary, estimate, unknown, summary)
 
 
 def on_one(target: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Compiled:
@@ -180,7 +186,7 @@ class Table:
 def report_one(options: argparse.Namespace) -> None:
     """One row for each program, and for each part of it."""
     columns = ["target", "preset", "dtype", "batch", "program", "lower s", "compile s", "temporary MB", "device MB"]
-    columns += ["unknown loops", "counted steps", "conditionals", "kernels", "estimate ms"]
+    columns += ["unknown loops", "counted steps", "conditionals", "kernels", "estimate ms", "of unknown cost"]
     table = Table(columns, options.json)
     for target, preset, dtype, batch in cases(options):
         config = replace(PRESETS[preset](), dtype=dtype)
@@ -221,6 +227,7 @@ def describe(found: Compiled) -> dict[str, Any]:
         "conditionals": summary.conditionals,
         "kernels": sum(summary.kernels.values()),
         "estimate ms": found.estimate_ms,
+        "of unknown cost": None if found.estimate_ms is None else found.of_unknown_cost,
         "by kind": summary.kernels,
     }
 
