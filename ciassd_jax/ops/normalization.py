@@ -37,8 +37,8 @@ def batch_norm(
 ) -> tuple[Float[Array, "*n C"], Float[Array, " C"], Float[Array, " C"], Float[Array, ""]]:
     """Normalise x by the mean and the biased variance of its real entries. Returns (y, mean, variance, count).
 
-    With `axis_name`, sums and counts are pooled over that axis before the division, so that every entry weighs the same
-    on whatever device it is. Without any entry, mean and variance are 0. Entries that are not real are scaled and
+    With `axis_name`, moments are pooled over that axis by the number of entries, so that every entry weighs the same on
+    whatever device it is. Without any entry, mean and variance are 0. Entries that are not real are scaled and
     shifted too. Only y has a gradient: two sums and one more pass over x, half of what differentiation step by step
     takes.
     """
@@ -52,13 +52,27 @@ def batch_norm(
 def _batch_norm(
     x: Array, real: Array | None, scale: Array, bias: Array, epsilon: float, axis_name: str | None
 ) -> tuple[Array, Array, Array, Array]:
-    total, count = _pooled((_real(x, real).sum(_axes(x)), _count(x, real)), axis_name)
-    share = 1 / jnp.maximum(count, 1)
-    mean = total * share
-    # Around the mean rather than from the mean square: no cancellation.
-    spread = _real(_wide(x) - _row(mean, x), real)
-    variance = _pooled((spread**2).sum(_axes(x)), axis_name) * share
+    mean, variance, count = _moments(x, real, axis_name)
     return scale_and_shift(x, scale, bias, mean, variance, epsilon=epsilon), mean, variance, count
+
+
+def _moments(x: Array, real: Array | None, axis_name: str | None) -> tuple[Array, Array, Array]:
+    """Mean, biased variance and number of the real entries, of all devices after one exchange."""
+    count = _count(x, real)
+    share = 1 / jnp.maximum(count, 1)
+    mean = _real(x, real).sum(_axes(x)) * share
+    # Around the mean rather than from the mean square: no cancellation.
+    squares = (_real(_wide(x) - _row(mean, x), real) ** 2).sum(_axes(x))
+    if axis_name is not None:
+        own = jnp.concatenate([mean, squares, count[None]])
+        # A sum in which every device has a row of its own is a gather whose result shard_map knows to be replicated.
+        rows = jnp.zeros((lax.axis_size(axis_name), own.size), own.dtype).at[lax.axis_index(axis_name)].set(own)
+        means, squares, counts = jnp.split(lax.psum(rows, axis_name), (len(mean), 2 * len(mean)), axis=1)
+        count = counts.sum()
+        share = 1 / jnp.maximum(count, 1)
+        mean = (counts * means).sum(0) * share
+        squares = (squares + counts * (means - mean[None]) ** 2).sum(0)
+    return mean, squares * share, count
 
 
 def _forward(x: Array, real: Array | None, scale: Array, bias: Array, epsilon: float, axis_name: str | None):  # type: ignore[no-untyped-def]
