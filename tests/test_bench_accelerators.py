@@ -83,6 +83,7 @@ def test_summary_of_a_program_of_this_backend() -> None:
     assert found.collectives == {}
 
 
+@pytest.mark.slow
 def test_parts_follow_one_another() -> None:
     from programs import predict, predict_parts, train_parts
 

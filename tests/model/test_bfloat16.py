@@ -88,6 +88,7 @@ def test_what_goes_in_and_comes_out_is_float32(function):
     assert {leaf.dtype for leaf in leaves} <= {jnp.dtype(name) for name in ("float32", "int32", "bool")}
 
 
+@pytest.mark.slow
 def test_a_step_is_near_that_in_float32():
     """Losses and gradient; Adam's first moment is a multiple of the latter."""
     config = small_config()

@@ -174,7 +174,7 @@ def test_gathered_equals_dense(grid, form, occupied):
         np.testing.assert_allclose(mine / scale, reference / scale, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", ["cpu", pytest.param("accelerator", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("capacities", [(80, 80, 20, 10), (30, 30, 6, 3)])
 def test_gradients_in_float64(capacities, form):
     """Of all four kinds of layer, with and without overflow."""
