@@ -147,11 +147,12 @@ class Table:
     """Rows as Markdown or JSON, each printed as soon as it is there; what does not fit is said after them."""
 
     def __init__(self, columns: Sequence[str], as_json: bool) -> None:
-        self.columns, self.as_json, self.remarks = columns, as_json, list[str]()
+        self.columns, self.as_json, self.remarks, self.rows = columns, as_json, list[str](), 0
         if not as_json:
             print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}", flush=True)
 
     def add(self, row: dict[str, Any]) -> None:
+        self.rows += 1
         if self.as_json:
             print(json.dumps(row), flush=True)
             return
@@ -197,6 +198,8 @@ def report_one(options: argparse.Namespace) -> None:
             if options.parts:
                 named = [(f"{whole_program[0]}: {name}", *rest) for name, *rest in parts(config, batch)]
                 report_programs(table, of, named, options.only, total=f"{whole_program[0]}: sum of these parts")
+    if not table.rows:
+        raise SystemExit(f"No program is called {options.only!r}; without --only all are listed.")
     table.close()
 
 
@@ -275,15 +278,23 @@ def cases(options: argparse.Namespace) -> Iterable[tuple[str, str, str, int]]:
                     yield target, preset, dtype, batch
 
 
+def positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
+    return int(text)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--targets", nargs="+", choices=TARGETS, default=list(TARGETS))
     parser.add_argument("--presets", nargs="+", choices=PRESETS, default=["car", "car_lite"])
     parser.add_argument("--dtypes", nargs="+", choices=("float32", "bfloat16"), default=["float32", "bfloat16"])
-    parser.add_argument("--batch", nargs="+", type=int, default=[1, 4], help="scenes, with --devices of each device")
+    parser.add_argument(
+        "--batch", nargs="+", type=positive, default=[1, 4], help="scenes, with --devices of each device"
+    )
     parser.add_argument("--parts", action="store_true", help="also each part alone")
     parser.add_argument("--only", default="", help="programs and parts whose name contains this text")
-    parser.add_argument("--devices", type=int, help="report the training step for so many devices instead")
+    parser.add_argument("--devices", type=positive, help="report the training step for so many devices instead")
     parser.add_argument("--automatic", action="store_true", help="with --devices, also as XLA partitions it by itself")
     parser.add_argument("--step-ms", type=float, default=20, help="assumed step without communication, for --devices")
     parser.add_argument("--json", action="store_true", help="one object a row instead of a Markdown table")

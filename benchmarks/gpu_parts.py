@@ -117,10 +117,15 @@ def latency(ready: Ready, repeats: int) -> Row:
 
 
 def agreement(plan: Plan, preset: str) -> Rows:
-    """Compare the boxes of the accelerator's program with those of the CPU's, frame by frame."""
+    """Compare the boxes of the device's program with those of the CPU's, frame by frame; any difference is an error.
+
+    Where the device is a CPU, it runs the accelerators' form.
+    """
     config, variables, origin = model_of(preset, plan.weights if preset == "car" else None)
     found = []
-    for name, device in (("accelerator", jax.devices()[0]), ("cpu", jax.devices("cpu")[0])):
+    first = jax.devices()[0]
+    form = "accelerator" if first.platform == "cpu" else "auto"
+    for name, device in ((form, first), ("cpu", jax.devices("cpu")[0])):
         clouds = [jax.device_put(scene.cloud, device) for scene in scenes_of(plan, config, 1)]
         placed = jax.device_put(variables, device)
         program, _ = compiled(partial(predict, config=replace(config, program=name)), placed, clouds[0])
@@ -128,7 +133,12 @@ def agreement(plan: Plan, preset: str) -> Rows:
     frames = [compare(here, there) for here, there in zip(*found, strict=True)]
     sums = {name: sum(frame[name] for frame in frames) for name in SUMS}
     worst = {name: max(frame[name] for frame in frames) for name in WORST}
-    yield {"dtype": config.dtype, "weights": origin, "frames": len(frames)} | sums | worst
+    row: Row = {"dtype": config.dtype, "weights": origin, "frames": len(frames)} | sums | worst
+    if origin != "random" and not sums["boxes"]:
+        row["error"] = "no boxes were found, so none was compared"
+    elif sums["alone"] or sums["other_counts"]:
+        row["error"] = f"{sums['alone']} boxes without a pair, {sums['other_counts']} frames with other counts"
+    yield row
 
 
 def compare(found: Any, expected: Any) -> Row:

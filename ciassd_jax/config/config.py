@@ -85,8 +85,8 @@ class Config:
         return len(self.classes) * len(self.head.angles)
 
     def to_json(self) -> str:
-        """Return the config as JSON text."""
-        return json.dumps(asdict(self), indent=1)
+        """Return the config as JSON text, without `program`: that is a choice of the machine, not of the detector."""
+        return json.dumps({name: value for name, value in asdict(self).items() if name != "program"}, indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> Config:

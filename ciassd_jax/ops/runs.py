@@ -82,7 +82,8 @@ def _read_lines(
     """
     count, (height, width) = len(maps), maps[0].shape
     more = size[1] - 1
-    cells = max(_LANES // count, size[1])
+    # At least so many that the overlap comes from the next stretch alone.
+    cells = max(_LANES // count, size[1], 2 * more)
     step = cells - more
     lines = -(-(width + more) // step)
     stretches = []

@@ -1,7 +1,8 @@
 """The training step as one pure function: state and scenes in, new state and metrics out.
 
-`train_step` runs under `jit`, also with a batch sharded over a mesh, and with `axis_name` under `pmap` or `shard_map`,
-where it pools batch statistics, gradients and metrics over that axis.
+`train_step` runs under `jit`, and with `axis_name` under `pmap` or `shard_map`, where it pools batch statistics,
+gradients and metrics over that axis. Under `jit` alone a batch may be sharded over a mesh too; XLA then gathers the
+features of all scenes on every device.
 """
 
 from __future__ import annotations

@@ -227,9 +227,17 @@ def test_json_that_is_not_a_config_is_refused(text):
         Config.from_json(text)
 
 
-@pytest.mark.parametrize("path", ["detection", "neck.channels", "schedule.remat", "dtype", "program"])
+@pytest.mark.parametrize("path", ["detection", "neck.channels", "schedule.remat", "dtype"])
 def test_a_missing_field_has_its_default(path):
     assert Config.from_json(edited(path, ...)) == car()
+
+
+def test_the_program_is_not_written_but_read():
+    """It is a choice of the machine: weights and runs do not carry it to another."""
+    config = replace(car(), program="cpu")
+    assert Config.from_json(config.to_json()) == car()
+    data = json.loads(config.to_json()) | {"program": "cpu"}
+    assert Config.from_json(json.dumps(data)) == config
 
 
 def with_old_names(config: Config) -> str:

@@ -439,7 +439,7 @@ def test_to_dense_puts_each_site_in_its_place(shape):
     np.testing.assert_array_equal(gradient, reference)
 
 
-@pytest.mark.parametrize("shape", [(41, 7, 100), (70, 3, 3), (3, 2, 300)])
+@pytest.mark.parametrize("shape", [(41, 7, 100), (70, 3, 3), (3, 2, 300), (1100, 2, 5)])
 def test_lines_read_what_cells_read(shape):
     """Windows of every size and place, some of them beside the grid."""
     number = np.prod(shape) // 3
