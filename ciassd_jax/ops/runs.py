@@ -40,6 +40,7 @@ def runs_at(
     assert sites.masks is not None, "sites of the dense backend have no maps"
     maps = (*lax.bitcast_convert_type(sites.masks, jnp.int32), sites.starts)
     cells, lines = partial(_read_cells, size=size), partial(_read_lines, size=size)
+    # One array of all maps: apart, a CPU would read them again for each of their uses.
     *words, start = by_platform(program, maps, y, x, cpu=cells, gpu=cells, accelerator=lines)
     slot, mask = start, jnp.zeros_like(start)
     for i, word in enumerate(words):
@@ -62,19 +63,19 @@ def _within(index: Int[Array, "*n"], size: int) -> Bool[Array, "*n"]:
 
 def _read_cells(
     maps: tuple[Array, ...], y: Int[Array, " V"], x: Int[Array, " V"], size: tuple[int, int]
-) -> list[Int[Array, "KY KX V"]]:
+) -> Int[Array, "M KY KX V"]:
     """Read every column of every map [Y, X] for itself; 0 outside of the maps."""
     height, width = maps[0].shape
     rows, columns = (n[None] + jnp.arange(k, dtype=jnp.int32)[:, None] for n, k in zip((y, x), size, strict=True))
     inside = _within(rows, height)[:, None] & _within(columns, width)[None]
     place = jnp.where(inside, rows[:, None] * width + columns[None], 0)
     read = (jnp.asarray(one).reshape(-1).at[place].get(mode="promise_in_bounds") for one in maps)
-    return [jnp.where(inside, values, 0) for values in read]
+    return jnp.stack([jnp.where(inside, values, 0) for values in read])
 
 
 def _read_lines(
     maps: tuple[Array, ...], y: Int[Array, " V"], x: Int[Array, " V"], size: tuple[int, int]
-) -> list[Int[Array, "KY KX V"]]:
+) -> Int[Array, "M KY KX V"]:
     """Read a row of columns of all maps at once: on a TPU the number of reads counts, not their width.
 
     A line holds the same stretch of x of every map, side by side. Lines overlap, so that one of them holds the whole
@@ -105,7 +106,7 @@ def _read_lines(
         value = jnp.where(lane == offset + (number * cells + column), read, 0).sum(1, dtype=jnp.int32)
         return jnp.where(inside, value, 0).reshape(size[0], -1)
 
-    return [jnp.stack([cell(number, column) for column in range(size[1])], 1) for number in range(count)]
+    return jnp.stack([jnp.stack([cell(number, column) for column in range(size[1])], 1) for number in range(count)])
 
 
 def followers(sites: Sites, *, depth: int, step: int = 1) -> Int[jax.Array, " V"]:
