@@ -15,13 +15,12 @@ import ciassd_jax
 from ciassd_jax import Boxes, Config, GroundTruth, PointCloud, Scene, create_train_state, init_variables
 from ciassd_jax.inference.postprocess import postprocess
 from ciassd_jax.model.anchors import make_anchors
-from ciassd_jax.model.backbone import SPConvNet
-from ciassd_jax.model.backends import Window, make_backend
+from ciassd_jax.model.backbone import SPConvNet, fold_height, sites_of
+from ciassd_jax.model.backends import make_backend
 from ciassd_jax.model.head import MultiTaskHead
 from ciassd_jax.model.neck import SSFA
 from ciassd_jax.model.network import predict_raw, voxelize_batch
-from ciassd_jax.ops import sites as site_ops
-from ciassd_jax.ops.sites import NO_SITE
+from ciassd_jax.ops.sites import Triple, Window
 from ciassd_jax.training.losses import detection_loss
 from ciassd_jax.training.optimizer import make_optimizer
 from ciassd_jax.training.targets import assign_targets
@@ -109,18 +108,12 @@ def sparse_parts(config: Config, voxels: SparseVoxels) -> Iterator[Program]:
     yield "fold to BEV", partial(fold_to_bev, config=config), (features, sites)
 
 
-def sites_of(voxels: SparseVoxels, *, shape: site_ops.Triple) -> Sites:
-    real = jnp.arange(voxels.coordinates.shape[1], dtype=jnp.int32)[None] < voxels.count[:, None]
-    keys = jnp.where(real, site_ops.linear_keys(voxels.coordinates, shape), NO_SITE)
-    return jax.vmap(partial(site_ops.active_sites, shape=shape))(keys)
-
-
 def strided_layer(sites: Sites, features: Any, kernel: Any, *, config: Config, window: Window, capacity: int) -> Any:
     out, convolution, _ = make_backend(config.backbone.backend, config.program).strided(sites, window, capacity)
     return out, jax.nn.relu(convolution(features, kernel))
 
 
-def submanifold_layers(sites: Sites, features: Any, kernels: Any, *, config: Config, shape: site_ops.Triple) -> Any:
+def submanifold_layers(sites: Sites, features: Any, kernels: Any, *, config: Config, shape: Triple) -> Any:
     convolution = make_backend(config.backbone.backend, config.program).submanifold(sites, shape)
     for kernel in kernels:
         features = jax.nn.relu(convolution(features, kernel))
@@ -130,7 +123,7 @@ def submanifold_layers(sites: Sites, features: Any, kernels: Any, *, config: Con
 def fold_to_bev(features: Any, sites: Sites, *, config: Config) -> Any:
     shape = config.backbone.stage_shapes(config.grid.shape)[-1]
     grid = make_backend(config.backbone.backend, config.program).to_dense(features, sites, shape)
-    return jnp.swapaxes(grid, 3, 4).reshape(*grid.shape[:3], -1)
+    return fold_height(grid)
 
 
 def train_parts(config: Config, batch: int) -> Iterator[Program]:

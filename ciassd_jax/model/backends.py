@@ -14,18 +14,8 @@ from ciassd_jax.model.layers import Convolution
 from ciassd_jax.ops import sites as site_ops
 from ciassd_jax.ops import sparse, sparse_dense
 from ciassd_jax.ops.platform import Program
-from ciassd_jax.ops.sites import Triple
+from ciassd_jax.ops.sites import Triple, Window
 from ciassd_jax.types import NeighbourTable, Sites
-
-
-class Window(NamedTuple):
-    """A convolution from the grid `shape` to the grid `out_shape`, both (z, y, x)."""
-
-    shape: Triple
-    out_shape: Triple
-    kernel: Triple
-    stride: Triple
-    padding: Triple
 
 
 class Backend(NamedTuple):

@@ -7,6 +7,8 @@ OR of the masks in its window, and its sites are listed from the new masks: noth
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,16 @@ from ciassd_jax.types import Array, Sites
 
 Triple = tuple[int, int, int]
 NO_SITE = np.int32(np.iinfo(np.int32).max)
+
+
+class Window(NamedTuple):
+    """A convolution from the grid `shape` to the grid `out_shape`, both (z, y, x)."""
+
+    shape: Triple
+    out_shape: Triple
+    kernel: Triple
+    stride: Triple
+    padding: Triple
 
 
 def linear_keys(coordinates: Int[Array, "*n 3"], shape: Triple) -> Int[Array, "*n"]:

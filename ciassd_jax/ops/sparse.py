@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from ciassd_jax.ops import runs as run_ops
 from ciassd_jax.ops.platform import Program, by_platform
-from ciassd_jax.ops.sites import NO_SITE, Triple, coordinates_of
+from ciassd_jax.ops.sites import NO_SITE, Triple, Window, coordinates_of
 from ciassd_jax.types import Array, NeighbourTable, Sites
 
 # Rows that a CPU gathers and multiplies at once: the gathered block must stay in cache.
@@ -28,7 +28,7 @@ _BLOCK_ROWS = 2000
 
 def submanifold_table(sites: Sites, *, shape: Triple, program: Program = "auto") -> NeighbourTable:
     """Neighbours of a 3 x 3 x 3 submanifold convolution."""
-    inputs = _inputs(sites, sites, shape, (3, 3, 3), (1, 1, 1), (1, 1, 1), shape, program)
+    inputs = _inputs(sites, sites, Window(shape, shape, (3, 3, 3), (1, 1, 1), (1, 1, 1)), program)
     following = run_ops.followers(sites, depth=shape[0])
     # What a site reads also reads it.
     return NeighbourTable(inputs, inputs, following, following, sites.count, sites.count)
@@ -49,9 +49,10 @@ def strided_table(
     axes = list(zip(kernel, stride, strict=True))
     assert axes[0][0] == run_ops.DEPTH, f"runs have three z, the kernel {kernel[0]}"
     assert set(axes) <= {(1, 1), (3, 1), (3, 2)}, f"no runs for a kernel of {kernel} with strides of {stride}"
+    window = Window(shape, out_shape, kernel, stride, padding)
     return NeighbourTable(
-        _inputs(sites, out_sites, shape, kernel, stride, padding, out_shape, program),
-        _outputs(sites, out_sites, shape, kernel, stride, padding, out_shape, program),
+        _inputs(sites, out_sites, window, program),
+        _outputs(sites, out_sites, window, program),
         run_ops.followers(sites, depth=shape[0]),
         run_ops.followers(out_sites, depth=out_shape[0], step=stride[0]),
         out_sites.count,
@@ -59,37 +60,21 @@ def strided_table(
     )
 
 
-def _inputs(
-    sites: Sites,
-    out_sites: Sites,
-    shape: Triple,
-    kernel: Triple,
-    stride: Triple,
-    padding: Triple,
-    out_shape: Triple,
-    program: Program,
-) -> Int[Array, "J V"]:
+def _inputs(sites: Sites, out_sites: Sites, window: Window, program: Program) -> Int[Array, "J V"]:
     """Runs of the inputs of every output o, from o * stride - padding on."""
-    z, y, x = (o * s - p for o, s, p in zip(coordinates_of(out_sites.keys, out_shape).T, stride, padding, strict=True))
+    places = coordinates_of(out_sites.keys, window.out_shape).T
+    z, y, x = (o * s - p for o, s, p in zip(places, window.stride, window.padding, strict=True))
     # Padding reads beside the grid.
-    y = jnp.where(out_sites.keys != NO_SITE, y, shape[1])
-    return run_ops.pack(*run_ops.runs_at(sites, z, y, x, size=kernel[1:], program=program))
+    y = jnp.where(out_sites.keys != NO_SITE, y, window.shape[1])
+    return run_ops.pack(*run_ops.runs_at(sites, z, y, x, size=window.kernel[1:], program=program))
 
 
-def _outputs(
-    sites: Sites,
-    out_sites: Sites,
-    shape: Triple,
-    kernel: Triple,
-    stride: Triple,
-    padding: Triple,
-    out_shape: Triple,
-    program: Program,
-) -> Int[Array, "J U"]:
+def _outputs(sites: Sites, out_sites: Sites, window: Window, program: Program) -> Int[Array, "J U"]:
     """Runs of the outputs that read every input i: (i + padding - k) / stride, where that is whole, by descending k."""
-    z, y, x = (i + p for i, p in zip(coordinates_of(sites.keys, shape).T, padding, strict=True))
+    z, y, x = (i + p for i, p in zip(coordinates_of(sites.keys, window.shape).T, window.padding, strict=True))
+    kernel, stride = window.kernel, window.stride
     first = [(n >> 1) - 1 if s == 2 else n - (k - 1) for n, s, k in zip((z, y, x), stride, kernel, strict=True)]
-    first[1] = jnp.where(sites.keys != NO_SITE, first[1], out_shape[1])
+    first[1] = jnp.where(sites.keys != NO_SITE, first[1], window.out_shape[1])
     columns = [2 if s == 2 else k for s, k in zip(stride[1:], kernel[1:], strict=True)]
     slot, mask = run_ops.runs_at(out_sites, *first, size=(columns[0], columns[1]), program=program)
     if stride[0] == 2:
