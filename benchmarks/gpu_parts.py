@@ -73,7 +73,8 @@ def frames_of(plan: Plan) -> tuple[list[Any], str]:
 def scenes_of(plan: Plan, config: Config, batch: int) -> list[Scene]:
     """Return batches of padded frames on the device."""
     padded = [pad_frame(frame, index, config) for index, frame in enumerate(frames_of(plan)[0])]
-    keep = jax.jit(jax.vmap(partial(keep_targets, minimum=config.grid.minimum, maximum=config.grid.maximum)))
+    minimum, maximum = config.range
+    keep = jax.jit(jax.vmap(partial(keep_targets, minimum=minimum, maximum=maximum)))
     groups = [padded[i : i + batch] for i in range(0, len(padded) - batch + 1, batch)]
     return [keep(jax.tree.map(lambda *leaves: np.stack(leaves), *group)) for group in groups]
 
@@ -207,7 +208,7 @@ def stages(plan: Plan, preset: str, dtype: str, batch: int) -> Rows:
         ready = Ready(lambda given: program(*given), [given], made)
         return program(*given), {"stage": name} | latency(ready, plan.repeats) | made
 
-    voxels, row = stage("voxelize", partial(voxelize_batch, grid=config.grid), cloud)
+    voxels, row = stage("voxelize", partial(voxelize_batch, config=config), cloud)
     yield row
     (bev, *sites), row = stage("backbone", partial(backbone.apply, train=False), of["backbone"], voxels)
     yield row

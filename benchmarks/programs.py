@@ -65,7 +65,7 @@ def predict_parts(config: Config, batch: int) -> Iterator[Program]:
     cloud = scenes(config, batch).cloud
     variables = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
     of = lambda part: {name: tree[part] for name, tree in variables.items() if part in tree}  # noqa: E731
-    voxelizer = partial(voxelize_batch, grid=config.grid)
+    voxelizer = partial(voxelize_batch, config=config)
     yield "voxelize", voxelizer, (cloud,)
     yield from sparse_parts(config, jax.eval_shape(voxelizer, cloud))
     bev = shape(batch, *config.bev_shape, config.bev_channels, dtype=how["dtype"])
@@ -130,7 +130,7 @@ def train_parts(config: Config, batch: int) -> Iterator[Program]:
     """The parts of `train_step`, each with its gradient."""
     batched, how = scenes(config, batch), {"dtype": jnp.dtype(config.dtype), "program": config.program}
     variables = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
-    voxelizer = partial(voxelize_batch, grid=config.grid)
+    voxelizer = partial(voxelize_batch, config=config)
     yield "voxelize", voxelizer, (batched.cloud,)
     voxels = jax.eval_shape(voxelizer, batched.cloud)
     bev = shape(batch, *config.bev_shape, config.bev_channels, dtype=how["dtype"])

@@ -57,7 +57,7 @@ def run(study: Study) -> Report:
 def parts_of(variables: Variables, config: Config) -> Callable[[Frame], dict[str, float]]:
     """Return a function that measures the milliseconds of each part on a frame."""
     variables = jax.device_put(variables)
-    voxelize = jax.jit(partial(voxelize_batch, grid=config.grid))
+    voxelize = jax.jit(partial(voxelize_batch, config=config))
     network = jax.jit(partial(predict_voxels, config=config))
     finish = jax.jit(partial(postprocess, config=config))
     whole = jax.jit(partial(predict, config=config))

@@ -8,6 +8,7 @@ from ciassd_jax.config.model import (
     DetectionConfig,
     GridConfig,
     HeadConfig,
+    InputConfig,
     NeckConfig,
     StageConfig,
 )
@@ -23,6 +24,7 @@ __all__ = [
     "DetectionConfig",
     "GridConfig",
     "HeadConfig",
+    "InputConfig",
     "LossConfig",
     "NeckConfig",
     "ScheduleConfig",

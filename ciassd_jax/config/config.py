@@ -16,15 +16,20 @@ from ciassd_jax.config.model import (
     DetectionConfig,
     GridConfig,
     HeadConfig,
+    InputConfig,
     NeckConfig,
 )
 from ciassd_jax.config.training import DataConfig, LossConfig, ScheduleConfig
+
+
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Config:
     """Everything that defines a detector and its training. The defaults are the paper's, `car()`."""
 
+    input: InputConfig = field(default_factory=InputConfig)
     grid: GridConfig = field(default_factory=GridConfig)
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     neck: NeckConfig = field(default_factory=NeckConfig)
@@ -42,8 +47,8 @@ class Config:
     program: Literal["auto", "cpu", "accelerator"] = "auto"
 
     def __post_init__(self) -> None:
-        if not self.classes or len({c.name for c in self.classes}) != len(self.classes):
-            raise ValueError("classes: give at least one, each with its own name.")
+        if not self.classes or len({c.name.lower() for c in self.classes}) != len(self.classes):
+            raise ValueError("classes: give at least one, each with its own name; case does not matter.")
         if self.dtype not in ("float32", "bfloat16", "float64"):
             raise ValueError(f"dtype: {self.dtype!r} is unknown; choose 'float32', 'bfloat16' or 'float64'.")
         if self.program not in ("auto", "cpu", "accelerator"):
@@ -68,6 +73,17 @@ class Config:
     def class_names(self) -> tuple[str, ...]:
         """Names of the classes in the order of their labels."""
         return tuple(c.name for c in self.classes)
+
+    def labels_by_name(self, *, similar: bool) -> dict[str, int]:
+        """Return the class of each label name in lower case, with `similar` also of the names that count as a class."""
+        labels = {name.lower(): label for label, one in enumerate(self.classes) for name in one.similar if similar}
+        return labels | {one.name.lower(): label for label, one in enumerate(self.classes)}
+
+    @property
+    def range(self) -> tuple[Vector, Vector]:
+        """Minimum and maximum (x, y, z) of the grid in the frame of the clouds, in metres."""
+        shift, (x, y, low), (right, left, high) = self.input.z_shift, self.grid.minimum, self.grid.maximum
+        return (x, y, low - shift), (right, left, high - shift)
 
     @property
     def bev_shape(self) -> tuple[int, int]:
@@ -115,7 +131,14 @@ class Config:
 jax.tree_util.register_static(Config)
 
 # Fields of a class that only target assignment, ground-truth sampling and evaluation read.
-_UNREAD_CLASS_FIELDS = ("matched", "unmatched", "similar", "gt_sampling_up_to", "gt_sampling_min_points")
+_UNREAD_CLASS_FIELDS = (
+    "matched",
+    "unmatched",
+    "similar",
+    "eval_overlap",
+    "gt_sampling_up_to",
+    "gt_sampling_min_points",
+)
 _UNREAD_CLASS = ClassConfig()
 
 

@@ -1,4 +1,4 @@
-"""The sections of a config that define the detector: grid, network, classes and post-processing.
+"""The sections of a config that define the detector: input, grid, network, classes and post-processing.
 
 Every section is a frozen, hashable dataclass of numbers, strings and tuples. It raises ValueError for a wrong value.
 """
@@ -8,6 +8,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from typing import Literal
+
+
+@dataclass(frozen=True)
+class InputConfig:
+    """What the network makes of a cloud's numbers, so that another sensor's clouds look as those of training did."""
+
+    # The intensity in the clouds that the network reads as 1: 255 for intensities of 0..255.
+    intensity_scale: float = 1.0
+    # Metres that the network adds to z. Boxes, and the labels they are compared with, stay in the cloud's frame.
+    z_shift: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.intensity_scale < math.inf:
+            raise ValueError(f"input.intensity_scale: {self.intensity_scale} must be positive and finite.")
+        if not math.isfinite(self.z_shift):
+            raise ValueError(f"input.z_shift: {self.z_shift} must be finite.")
 
 
 @dataclass(frozen=True)
@@ -167,8 +183,10 @@ class ClassConfig:
     unmatched: float = 0.45
     # A detection needs more IoU-weighted support than this (mu of Algorithm 1).
     support_threshold: float = 2.6
-    # Labels that count as this class in training (paper section 4.1: vans as cars).
+    # Labels that count as this class in training (paper section 4.1: vans as cars). Case does not matter in names.
     similar: tuple[str, ...] = ()
+    # Overlap that a detection must exceed in evaluation. KITTI's three classes have the official ones instead.
+    eval_overlap: float = 0.5
     # Ground-truth sampling adds objects until a scene has this number of the class; 0 adds none.
     gt_sampling_up_to: int = 0
     # Objects with fewer points are not sampled.
@@ -179,6 +197,8 @@ class ClassConfig:
             raise ValueError(f"class {self.name}: width, length and height must be positive.")
         if not 0 < self.unmatched <= self.matched <= 1:
             raise ValueError(f"class {self.name}: thresholds must satisfy 0 < unmatched <= matched <= 1.")
+        if not 0 < self.eval_overlap < 1:
+            raise ValueError(f"class {self.name}: eval_overlap {self.eval_overlap} is outside (0, 1).")
         if self.gt_sampling_up_to < 0 or self.gt_sampling_min_points < 1:
             raise ValueError(
                 f"class {self.name}: gt_sampling_up_to must be at least 0 and gt_sampling_min_points at least 1."
@@ -217,6 +237,7 @@ class DetectionConfig:
     # last. With nms="released" there are no boxes from the last distance on.
     sigma_squared: tuple[float, float, float, float] = (0.0009, 0.009, 0.1, 1.0)
     sigma_distances: tuple[float, float, float] = (20.0, 40.0, 60.0)
+    # Boxes whose centre is lower or higher than this, in the network's frame, are dropped.
     z_limits: tuple[float, float] = (-5.0, 5.0)
 
     def __post_init__(self) -> None:

@@ -38,7 +38,8 @@ def augment(key: jax.Array, scene: Scene, objects: SampledObjects, config: Confi
     if switches.global_transform:
         scene = transform_globally(for_transform, scene, switches)
     scene = shuffle_points(for_order, scene)
-    return keep_targets(scene, minimum=config.grid.minimum, maximum=config.grid.maximum)
+    minimum, maximum = config.range
+    return keep_targets(scene, minimum=minimum, maximum=maximum)
 
 
 def add_sampled_objects(scene: Scene, objects: SampledObjects, *, gt_sampling_up_to: tuple[int, ...]) -> Scene:

@@ -153,7 +153,7 @@ def _begin_worker(index: int, count: int) -> None:
 @jax.jit
 def finish_scenes(host: HostScene, seed: Int[Array, ""], config: Config) -> Scene:
     """Run the device's part: augment a batch, or without objects only drop boxes that are not targets."""
-    minimum, maximum = config.grid.minimum, config.grid.maximum
+    minimum, maximum = config.range
 
     def finish(scene: Scene, objects: SampledObjects | None, epoch: Array) -> Scene:
         if objects is None:

@@ -115,8 +115,8 @@ def postprocess(raw: RawPredictions, config: Config, *, frustum: Float[Array, "B
     `frustum` (`ops.camera.frustum_planes`) drops boxes whose centre is outside the camera's view.
     """
     anchors, labels = make_anchors(config)
-    (low, high), grid = config.detection.z_limits, config.grid
-    minimum, maximum = (*grid.minimum[:2], low), (*grid.maximum[:2], high)
+    (low, high), grid, shift = config.detection.z_limits, config.grid, config.input.z_shift
+    minimum, maximum = (*grid.minimum[:2], low - shift), (*grid.maximum[:2], high - shift)
 
     def one_scene(scene: RawPredictions, planes: Array | None) -> Detections:
         candidates, dropped = select_candidates(scene.predictions, anchors, labels, config.detection)

@@ -11,7 +11,8 @@ from ciassd_jax.types import Boxes
 def make_anchors(config: Config) -> tuple[Boxes, np.ndarray]:
     """Return the anchors [A] as NumPy float32 and the class label [A] of each.
 
-    Order: y slowest, then x, then class, then angle. Centres are computed in float64 and rounded once.
+    Order: y slowest, then x, then class, then angle. Centres, in the frame of the clouds, are computed in float64 and
+    rounded once.
     """
     height, width = config.bev_shape
     grid, stride = config.grid, config.backbone.stride
@@ -20,7 +21,7 @@ def make_anchors(config: Config) -> tuple[Boxes, np.ndarray]:
         for axis, cells in ((0, width), (1, height))
     )
     sizes = np.array([(c.length, c.width, c.height) for c in config.classes])
-    heights = np.array([c.center_z for c in config.classes])
+    heights = np.array([c.center_z for c in config.classes]) - config.input.z_shift
     yaws = -np.array(config.head.angles) - np.pi / 2
     shape = (height, width, len(config.classes), len(config.head.angles))
     center = np.stack(

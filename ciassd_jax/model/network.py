@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from ciassd_jax.config import Config, GridConfig
+from ciassd_jax.config import Config
 from ciassd_jax.model.backbone import SPConvNet
 from ciassd_jax.model.head import MultiTaskHead
 from ciassd_jax.model.neck import SSFA, ConvolutionStack
@@ -70,8 +70,12 @@ class RawPredictions(NamedTuple):
     sites_dropped: Array
 
 
-def voxelize_batch(cloud: PointCloud, grid: GridConfig) -> SparseVoxels:
-    """Voxelise a batch of padded clouds as the config says."""
+def voxelize_batch(cloud: PointCloud, config: Config) -> SparseVoxels:
+    """Voxelise a batch of padded clouds; voxels and their features have the scale and height of `config.input`."""
+    grid, scale, shift = config.grid, config.input.intensity_scale, config.input.z_shift
+    if (scale, shift) != (1, 0):
+        factor, offset = jnp.array([1, 1, 1, 1 / scale], jnp.float32), jnp.array([0, 0, shift, 0], jnp.float32)
+        cloud = cloud._replace(points=cloud.points * factor[None, None] + offset[None, None])
     return jax.vmap(
         partial(
             voxelize,
@@ -89,7 +93,7 @@ def voxelize_batch(cloud: PointCloud, grid: GridConfig) -> SparseVoxels:
 def predict_raw(state_or_variables: Variables, cloud: PointCloud, config: Config) -> RawPredictions:
     """Voxelise and run the network in evaluation mode; `cloud` has a leading batch axis."""
     with jax.named_scope("voxelize"):
-        voxels = voxelize_batch(cloud, config.grid)
+        voxels = voxelize_batch(cloud, config)
     return predict_voxels(state_or_variables, voxels, config)
 
 

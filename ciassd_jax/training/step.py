@@ -85,7 +85,7 @@ def _loss(
 ) -> tuple[jax.Array, tuple[LossTerms, Targets, Any, dict[str, jax.Array]]]:
     """Return the total loss of the batch, and (terms, targets, new batch statistics, overflow counts)."""
     with jax.named_scope("voxelize"):
-        voxels = voxelize_batch(batch.cloud, config.grid)
+        voxels = voxelize_batch(batch.cloud, config)
 
     def forward(params: Any) -> Any:
         variables = {"params": params, "batch_stats": batch_stats}

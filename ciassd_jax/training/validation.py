@@ -69,7 +69,7 @@ def count_found(
     KITTI's difficulties up to it (0 easy, 1 moderate, 2 hard).
     """
     detector, found, targets = Detector(variables, config), 0, 0
-    low, high = np.array(config.grid.minimum), np.array(config.grid.maximum)
+    low, high = map(np.array, config.range)
     for index in range(len(dataset)):
         frame = dataset.read(index)
         result = detector(frame.points, frustum=frustum_of(frame.camera))

@@ -194,7 +194,7 @@ def train_backbone(variables, voxels, config):
 
 def small_voxels(*numbers: int) -> SparseVoxels:
     scenes = [random_points(seed, number, SMALL.grid) for seed, number in enumerate(numbers)]
-    return jax.tree.map(np.asarray, voxelize_batch(batch_of(*scenes), SMALL.grid))
+    return jax.tree.map(np.asarray, voxelize_batch(batch_of(*scenes), SMALL))
 
 
 def test_backends_agree(variables):
