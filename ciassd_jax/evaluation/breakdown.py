@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ciassd_jax.evaluation.kitti_ap import LIMITS, Curve, Evaluand, Within, is_evaluated, trace_levels
+from ciassd_jax.evaluation.kitti_ap import Curve, Evaluand, Limits, Within, is_evaluated, trace_levels
 from ciassd_jax.evaluation.overlap import Geometry
 
 # Lower ends of the intervals; the last interval is unbounded.
@@ -24,19 +24,19 @@ class Row(NamedTuple):
     curves: tuple[Curve, ...]
 
 
-def rows_by_distance(evaluand: Evaluand) -> list[Row]:
+def rows_by_distance(evaluand: Evaluand, limits: Limits) -> list[Row]:
     """Return rows of every evaluated class by the horizontal distance from the sensor, in metres."""
     truths, detections = evaluand.truths.boxes.center, evaluand.detections.boxes.center
     distances = np.hypot(truths[:, 0], truths[:, 1]), np.hypot(detections[:, 0], detections[:, 1])
-    return _rows(evaluand, *distances, DISTANCES, "m")
+    return _rows(evaluand, limits, *distances, DISTANCES, "m")
 
 
-def rows_by_points(evaluand: Evaluand) -> list[Row]:
+def rows_by_points(evaluand: Evaluand, limits: Limits) -> list[Row]:
     """Return rows by the number of points in a box, or none if it is unknown for labels or detections."""
     points, found = evaluand.truths.points, evaluand.detections.points
     if (points < 0).any() or (found < 0).any():
         return []
-    return _rows(evaluand, points, found, POINTS, "points")
+    return _rows(evaluand, limits, points, found, POINTS, "points")
 
 
 def correlation(evaluand: Evaluand, name: str) -> float:
@@ -62,11 +62,16 @@ def pearson(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _rows(
-    evaluand: Evaluand, truths: np.ndarray, detections: np.ndarray, starts: tuple[int, ...], unit: str
+    evaluand: Evaluand,
+    limits: Limits,
+    truths: np.ndarray,
+    detections: np.ndarray,
+    starts: tuple[int, ...],
+    unit: str,
 ) -> list[Row]:
     rows = []
     ends = (*starts[1:], np.inf)
-    for name, (limit, _) in LIMITS.items():
+    for name, (limit, *_) in limits.items():
         for geometry in ("bev", "3d"):
             if not is_evaluated(evaluand.detections, name, geometry):
                 continue

@@ -6,12 +6,13 @@ detection makes neither a hit nor a false positive. Detections too low for the l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
+from ciassd_jax.config import Config
 from ciassd_jax.evaluation.matching import Pairs, assign, order_pairs, pick_thresholds
 from ciassd_jax.evaluation.objects import DetectedObjects, FlatObjects, LabelledObjects, flatten, select
 from ciassd_jax.evaluation.overlap import Geometry, Intersections, intersect
@@ -19,10 +20,12 @@ from ciassd_jax.formats.kitti_rows import DIFFICULTIES
 
 Metric = Literal["bbox", "bev", "3d", "aos"]
 Recall = Literal["R11", "R40"]
+# The overlaps that detections of each class must exceed, the strict one first. Case does not matter in names.
+Limits = Mapping[str, tuple[float, ...]]
 METRICS: tuple[Metric, ...] = ("bbox", "bev", "3d", "aos")
 # The official and the loose limit of overlap; in the image only the official one is used.
-LIMITS = {"Car": (0.7, 0.5), "Pedestrian": (0.5, 0.25), "Cyclist": (0.5, 0.25)}
-_NEIGHBOURS = {"Car": "van", "Pedestrian": "person_sitting", "Cyclist": ""}
+LIMITS: Limits = {"Car": (0.7, 0.5), "Pedestrian": (0.5, 0.25), "Cyclist": (0.5, 0.25)}
+NEIGHBOURS = {"car": "van", "pedestrian": "person_sitting"}
 _NO_ALPHA = -10.0
 # Points of a precision-recall curve, at recall 0, 1/40 to 1. With fewer objects the last ones stay 0.
 CURVE_POINTS = 41
@@ -68,6 +71,12 @@ class Within(NamedTuple):
 
     truths: Bool[np.ndarray, " G"]
     detections: Bool[np.ndarray, " D"]
+
+
+def limits_of(config: Config) -> Limits:
+    """Return the limits of a config's classes: the official ones of KITTI's classes, `eval_overlap` of others."""
+    official = {name.lower(): limits for name, limits in LIMITS.items()}
+    return {one.name: official.get(one.name.lower(), (one.eval_overlap,)) for one in config.classes}
 
 
 def prepare(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObjects]) -> Evaluand:
@@ -192,7 +201,8 @@ def _state_case(
         valid_truths &= within.truths
         countable &= within.detections
     pairs = evaluand.shared[geometry]
-    present_truths, present = same | (truths.types == _NEIGHBOURS[name]), of_class | low
+    present_truths = same | (truths.types == NEIGHBOURS.get(name.lower(), ""))
+    present = of_class | low
     kept = np.flatnonzero((pairs.overlap > limit) & present_truths[pairs.first] & present[pairs.second])
     first, second = pairs.first[kept], pairs.second[kept]
     return _Case(

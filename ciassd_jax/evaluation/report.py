@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 
 from ciassd_jax.evaluation.breakdown import Row
-from ciassd_jax.evaluation.kitti_ap import CURVE_POINTS, LIMITS, METRICS, Metric, Recall, average_precision
+from ciassd_jax.evaluation.kitti_ap import CURVE_POINTS, METRICS, Metric, Recall, average_precision
 from ciassd_jax.evaluation.summary import Evaluation
 from ciassd_jax.formats.kitti_rows import DIFFICULTIES
 
@@ -37,7 +37,7 @@ def to_json(evaluation: Evaluation) -> Precisions:
 def format_block(evaluation: Evaluation) -> str:
     """Return the block that other toolboxes print and scripts parse, without classes that have no detections."""
     lines = []
-    for name, limits in LIMITS.items():
+    for name, limits in evaluation.limits.items():
         if all(evaluation.curves[name, metric, limits[0]] is None for metric in METRICS):
             continue
         for limit in limits:
@@ -75,7 +75,7 @@ _HEAD_OF_PARTS = f"{'class':<12}{'metric':<8}{'part':>14}{_LEVELS}{'objects':>10
 
 
 def _block_lines(evaluation: Evaluation, name: str, limit: float, recall: Recall) -> Iterable[str]:
-    official = LIMITS[name][0]
+    official = evaluation.limits[name][0]
     for metric in METRICS:
         values = evaluation.precision(name, metric, limit if metric in ("bev", "3d") else official, recall)
         # Other toolboxes omit orientation if it is disabled, but no other metric.
@@ -86,7 +86,7 @@ def _block_lines(evaluation: Evaluation, name: str, limit: float, recall: Recall
 
 def _main_table(evaluation: Evaluation) -> str:
     lines = [f"AP in percent by KITTI's rules, frames: {evaluation.num_frames}", _HEAD]
-    for name, limits in LIMITS.items():
+    for name, limits in evaluation.limits.items():
         rows = [
             _main_line(evaluation, name, metric, limit)
             for limit in limits
@@ -119,7 +119,7 @@ def _notes(evaluation: Evaluation) -> Iterable[str]:
             "No camera: difficulty is by the number of points in an object's box, no detection is too low, and bbox "
             "and aos are not evaluated; these are not KITTI's numbers."
         )
-    elif all(evaluation.curves[name, "aos", limits[0]] is None for name, limits in LIMITS.items()):
+    elif all(evaluation.curves[name, "aos", limits[0]] is None for name, limits in evaluation.limits.items()):
         yield "Orientation (aos) is not evaluated, as a detection has alpha -10 or none is in the image."
     if not evaluation.by_points:
         yield "Nothing by number of points, as the points in the boxes are not known here."

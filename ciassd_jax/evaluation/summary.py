@@ -10,6 +10,7 @@ from ciassd_jax.evaluation.kitti_ap import (
     LIMITS,
     METRICS,
     Curve,
+    Limits,
     Metric,
     Recall,
     average_precision,
@@ -30,6 +31,7 @@ class Evaluation(NamedTuple):
     """
 
     num_frames: int
+    limits: Limits
     has_camera: bool
     curves: dict[tuple[str, Metric, float], tuple[Curve, ...] | None]
     by_distance: list[Row]
@@ -44,7 +46,9 @@ class Evaluation(NamedTuple):
         return [average_precision(c.orientation if metric == "aos" else c.precision, recall) for c in curves]
 
 
-def evaluate(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObjects]) -> Evaluation:
+def evaluate(
+    truths: Sequence[LabelledObjects], detections: Sequence[DetectedObjects], limits: Limits = LIMITS
+) -> Evaluation:
     """Evaluate detections by KITTI's official rules; both lists hold one record per frame, in the same order.
 
     For KITTI's files, make the records with `labels_from_rows` and `detections_from_rows`. Records of data without a
@@ -53,19 +57,20 @@ def evaluate(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObj
     """
     evaluand = prepare(truths, detections)
     curves: dict[tuple[str, Metric, float], tuple[Curve, ...] | None] = {}
-    for name, limits in LIMITS.items():
+    for name, of_class in limits.items():
         for metric in METRICS:
             geometry = "bbox" if metric == "aos" else metric
-            for limit in limits if metric in ("bev", "3d") else limits[:1]:
+            for limit in of_class if metric in ("bev", "3d") else of_class[:1]:
                 traced = None
                 if is_evaluated(evaluand.detections, name, metric):
                     traced = curves.get((name, geometry, limit)) or trace_levels(evaluand, name, geometry, limit)
                 curves[name, metric, limit] = traced
     return Evaluation(
         len(truths),
+        limits,
         evaluand.has_camera,
         curves,
-        rows_by_distance(evaluand),
-        rows_by_points(evaluand),
-        {name: correlation(evaluand, name) for name in LIMITS},
+        rows_by_distance(evaluand, limits),
+        rows_by_points(evaluand, limits),
+        {name: correlation(evaluand, name) for name in limits},
     )
