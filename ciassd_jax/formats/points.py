@@ -1,6 +1,6 @@
-"""Point clouds in `.bin` (KITTI), `.npy`, `.npz` and `.pcd` files.
+"""Point clouds in `.bin` (KITTI), `.npy`, `.npz`, `.pcd` and `.ply` files.
 
-Readers return the values of the file; cleaning (NaN, `scale_intensity`) is left to the caller.
+Readers return the values of the file; what they are worth (NaN, `check_intensity`) is judged by the caller.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from jaxtyping import Float, Float32
 
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike, read_bytes
 
-POINT_SUFFIXES = (".bin", ".npy", ".npz", ".pcd")
+POINT_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 
 _INTENSITY_FIELDS = ("intensity", "reflectance", "i")
 _PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -24,18 +25,19 @@ _PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 
 # Arbitrary bytes read as floats need no warnings of NumPy's arithmetic.
 @np.errstate(over="ignore", invalid="ignore")
-def read_points(path: Pathlike, width: int = 4) -> Float32[np.ndarray, "N 4"]:
+def read_points(path: Pathlike, columns: int | Sequence[str] | None = None) -> Float32[np.ndarray, "N 4"]:
     """Read a point cloud as (x, y, z, intensity), coordinates in metres.
 
-    - `.bin`: little-endian float32, `width` (at least 3) numbers per point.
+    - `.bin`: little-endian float32, `columns` (4 if None) numbers per point.
     - `.npy`, `.npz`: an array (N, 3 or more); in an archive the array `points`, or the only one.
     - `.pcd`: ascii or binary, fields x, y, z and one of intensity, reflectance, i.
 
     Columns after the fourth are ignored. A missing intensity becomes 0, with a FormatWarning. Raises InputError, one
     sentence with the remedy, for a file that is missing, empty or malformed.
     """
+    width = columns if isinstance(columns, int) else 4 if columns is None else len(columns)
     if width < 3:
-        raise ValueError(f"width is {width}; a point has at least the 3 numbers x, y, z.")
+        raise InputError(f"{path}: {width} columns are too few; pass at least x,y,z as `columns`.")
     suffix = Path(path).suffix.lower()
     data = read_bytes(path)
     if suffix not in POINT_SUFFIXES:
@@ -46,9 +48,40 @@ def read_points(path: Pathlike, width: int = 4) -> Float32[np.ndarray, "N 4"]:
         array = _read_bin(data, path, width)
     elif suffix == ".pcd":
         array = _read_pcd(data, path)
+    elif suffix == ".ply":
+        raise InputError(f"{path} is not read yet; save it as .npy.")
     else:
         array = _read_numpy(data, path, archive=suffix == ".npz")
     return _as_points(array, path)
+
+
+def parse_columns(text: str) -> int | tuple[str, ...]:
+    """Parse "5" or "x,y,z,intensity,ring" into what `read_points` takes as `columns`."""
+    text = text.strip()
+    return int(text) if text.isdecimal() else tuple(name.strip() for name in text.split(","))
+
+
+def check_intensity(
+    points: Float32[np.ndarray, "N 4"], scale: float, source: Pathlike
+) -> tuple[Float32[np.ndarray, "N 4"], int]:
+    """Return points with intensities clipped to [0, scale], and how many were clipped.
+
+    Raises InputError if more than 1 % lie outside. Intensities beyond 1000 times the scale are left for the
+    voxelisation to drop and count.
+    """
+    intensity = points[:, 3]
+    outside = (intensity < 0) | (intensity > scale)
+    if outside.sum() > len(points) / 100:
+        raise InputError(
+            f"{source} has {outside.mean():.0%} of its intensities outside [0, {scale:g}], up to {intensity.max():g}; "
+            f"pass {intensity.max():g} as `intensity_scale`."
+        )
+    clipped = outside & (np.abs(intensity) <= 1000 * scale)
+    if not clipped.any():
+        return points, 0
+    points = points.copy()
+    points[clipped, 3] = np.clip(points[clipped, 3], 0, scale)
+    return points, int(clipped.sum())
 
 
 def write_bin(path: Pathlike, points: Float[np.ndarray, "N 4"]) -> None:
@@ -87,7 +120,7 @@ def _read_bin(data: bytes, path: Pathlike, width: int) -> Float32[np.ndarray, "N
     if len(data) % (4 * width):
         raise InputError(
             f"{path} has {len(data)} bytes, not a multiple of {4 * width} ({width} float32 per point); "
-            "copy it again, or pass the correct number as `width`."
+            "copy it again, or pass the correct number as `columns`."
         )
     return np.frombuffer(data, "<f4").reshape(-1, width)
 

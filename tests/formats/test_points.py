@@ -88,9 +88,9 @@ def test_bin_round_trip_and_other_widths(tmp_path):
     write_bin(tmp_path / "a.bin", POINTS)
     np.testing.assert_array_equal(read_points(str(tmp_path / "a.bin")), POINTS)
     (tmp_path / "five.bin").write_bytes(np.pad(POINTS, ((0, 0), (0, 1))).tobytes())
-    np.testing.assert_array_equal(read_points(tmp_path / "five.bin", width=5), POINTS)
-    with pytest.raises(ValueError, match="width is 2"):
-        read_points(tmp_path / "a.bin", width=2)
+    np.testing.assert_array_equal(read_points(tmp_path / "five.bin", columns=5), POINTS)
+    with pytest.raises(InputError, match="2 columns are too few"):
+        read_points(tmp_path / "a.bin", columns=2)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ BAD = {
         bytes(40),
         r"has 40 bytes, not a multiple of 16 \(4 float32 per point\); copy it again, or pass",
     ),
-    "scan.las": (bytes(16), "unknown suffix '.las'; convert it to one of .bin, .npy, .npz, .pcd"),
+    "scan.las": (bytes(16), "unknown suffix '.las'; convert it to one of .bin, .npy, .npz, .pcd, .ply"),
     "scan": (bytes(16), "unknown suffix ''; convert"),
     "flat.npy": (
         saved(np.save, POINTS.reshape(-1)),
