@@ -109,7 +109,7 @@ class SparseVoxels(NamedTuple):
 
     `features` are the mean of a voxel's first points, `coordinates` are (z, y, x), and `first_point` is the index of
     the first point in the voxel. `dropped` counts voxels over capacity, `points_given` all points of the cloud,
-    `points_dropped` those that are not finite and those whose voxel was dropped.
+    `points_dropped` those that are not finite or have an intensity beyond 1000, and those whose voxel was dropped.
     """
 
     features: Float[Array, "*b V C"]
@@ -207,8 +207,8 @@ class TrainState(NamedTuple):
 class Counts(NamedTuple):
     """How much of a scene was used, and how much did not fit into the fixed capacities.
 
-    `points_dropped` counts points that are not finite and points in range whose voxel was over capacity. Points beyond
-    `grid.max_points_per_voxel` are not counted: the method ignores them by design.
+    `points_dropped` counts points that are not finite or have an intensity beyond 1000, and points in range whose voxel
+    was over capacity. Points beyond `grid.max_points_per_voxel` are not counted: the method ignores them by design.
     """
 
     points_given: Int[Array, "*b"]

@@ -9,11 +9,12 @@ import gc
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import tyro
 
+from ciassd_jax.cli.config_options import Replaced, print_fields, take_fields
 from ciassd_jax.cli.convert import Convert
 from ciassd_jax.cli.data_check import Check
 from ciassd_jax.cli.data_prepare import Prepare
@@ -21,7 +22,7 @@ from ciassd_jax.cli.data_synth import Synth
 from ciassd_jax.cli.demo import Demo
 from ciassd_jax.cli.eval import Evaluate
 from ciassd_jax.cli.info import Info
-from ciassd_jax.cli.messages import UsageError, describe, silenced
+from ciassd_jax.cli.messages import UsageError, describe, option_of, silenced
 from ciassd_jax.cli.predict import Predict
 from ciassd_jax.cli.renamed import check_names
 from ciassd_jax.cli.submit import Submit
@@ -84,10 +85,23 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _parse(arguments: Sequence[str]) -> Command:
-    return tyro.cli(
+    if "--help-config" in arguments:
+        print_fields(arguments)
+    replaced, others = take_fields(arguments)
+    command = tyro.cli(
         Command,
         prog="ciassd",
-        args=arguments,
+        args=others,
         description="LiDAR 3D object detection in JAX.",
         config=(tyro.conf.DisallowNone, tyro.conf.PositionalMetavarFromFieldName),
     )
+    return command if replaced is None else _with_fields(command, replaced)
+
+
+def _with_fields(command: Any, replaced: Replaced) -> Any:
+    """Return the command with the config whose fields were replaced; raise UsageError if it uses no config."""
+    if isinstance(command, Data):
+        return replace(command, action=_with_fields(command.action, replaced))
+    if not hasattr(command, "config_options"):
+        raise UsageError(f"This command has no config; leave out {option_of(replaced.names[0])}.")
+    return replace(command, config_options=replace(command.config_options, replaced=replaced))

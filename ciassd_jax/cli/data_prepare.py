@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
-from ciassd_jax.cli.options import ImageSize, Unset
+from ciassd_jax.cli.options import Columns, ImageSize, Unset, read_columns
+from ciassd_jax.config import Config
 from ciassd_jax.data.folders import find_root, is_custom, open_dataset
-from ciassd_jax.data.gt_sampling import build_database, database_path
+from ciassd_jax.data.gt_sampling import (
+    ObjectDatabase,
+    build_database,
+    database_path,
+    eligible_objects,
+    open_database,
+)
 from ciassd_jax.data.kitti import write_reduced
 from ciassd_jax.formats.writing import check_folder
 
@@ -29,6 +37,8 @@ class Prepare:
     reduce: bool = False
     """First crop the full clouds of a KITTI folder to the camera's view, and write them to velodyne_reduced."""
     image_size: ImageSize = None
+    columns: Columns = None
+    config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 
     def run(self) -> int:
         root = find_root(self.root)
@@ -39,7 +49,17 @@ class Prepare:
                 if is_custom(root):
                     raise UsageError(f"{root} has no camera to crop clouds to; leave out --reduce.")
                 print(f"Wrote {write_reduced(root, self.image_size, frames_with_bar)} cropped clouds.")
-            dataset = open_dataset(root, self.split, self.image_size)
+            dataset = open_dataset(root, self.split, self.image_size, read_columns(self.columns))
             build_database(dataset, path, frames_with_bar)
         print(f"Wrote the objects of {len(dataset)} frames to {path}.")
+        print(_describe_classes(open_database(path, dataset), self.config_options.resolve()))
         return 0
+
+
+def _describe_classes(database: ObjectDatabase, config: Config) -> str:
+    """How many objects of each class training can sample."""
+    strict = config.data.augmentation.difficulty_filter
+    counts = {one.name: len(eligible_objects(database, one, difficulty_filter=strict)) for one in config.classes}
+    found = ", ".join(f"{count} of class {name}" for name, count in counts.items())
+    types = ", ".join(database.names) or "none"
+    return f"Training can sample {found}; the labels have the types {types}."

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
-from ciassd_jax.cli.options import load_as, open_simulated
+from ciassd_jax.cli.options import Columns, open_simulated, read_columns
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.formats.writing import check_folder, replacing
 from ciassd_jax.inference.detector import Detector
@@ -34,12 +35,14 @@ class Demo:
     """Number of streets to simulate."""
     seed: int = 0
     """Seed of the streets."""
+    columns: Columns = None
+    config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 
     def run(self) -> int:
         if self.scenes < 1:
             raise UsageError(f"--scenes {self.scenes} shows nothing; ask for at least 1.")
         with warnings_as_lines(self.file or "simulated street"):
-            weights = load_as(self.weights, None)
+            weights = self.config_options.load(self.weights)
             check_folder(self.out)
             frames = self._frames()
             detector = Detector(weights.variables, weights.config)
@@ -47,7 +50,7 @@ class Demo:
             detector.compile(max(len(frame.points) for frame in frames))
             written, shown = [], []
             for frame in frames:
-                result = detector(frame.points)
+                result = detector(frame.points, source=self.file or frame.name)
                 objects = "" if self.file else f", {len(frame.truth)} labelled objects"
                 print(f"\n{frame.name}: {len(frame.points)} points{objects}\n{result}", flush=True)
                 shown.append(result.show_in(frame))
@@ -61,7 +64,7 @@ class Demo:
     def _frames(self) -> list[ViewFrame]:
         """The file's points, or simulated scenes with their labels as the camera sees them."""
         if self.file is not None:
-            return [ViewFrame(self.file.stem, read_points(self.file))]
+            return [ViewFrame(self.file.stem, read_points(self.file, read_columns(self.columns)))]
         print(f"Simulating {self.scenes} streets, scanned by a LiDAR with 64 beams.", flush=True)
         dataset = open_simulated("all", self.scenes, self.seed)
         return [frame_to_view(dataset.read(index))._replace(name=f"street_{index}") for index in range(self.scenes)]

@@ -9,8 +9,9 @@ from typing import Annotated
 
 import tyro
 
+from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
-from ciassd_jax.cli.options import Dtype, Frames, Preset, Unset, load_as, override
+from ciassd_jax.cli.options import Dtype, Frames, Unset
 from ciassd_jax.evaluation import Evaluation, evaluate, format_json, format_report, read_folders
 from ciassd_jax.formats.writing import check_folder, write_text
 from ciassd_jax.inference.detector import Detector
@@ -62,8 +63,7 @@ class Evaluate:
     """Folder for the detections of every frame (NAME.txt), result.json and table.log."""
     json: Unset[Path] = None
     """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
-    preset: Unset[Preset] = None
-    """Use the config of this preset instead of the one in the weights file; the parameters must fit."""
+    config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     dtype: Unset[Dtype] = None
     """Compute type of the network; by default that of the weights."""
     score_threshold: Unset[float] = None
@@ -81,16 +81,16 @@ class Evaluate:
         return self.files.run()
 
     def _network(self) -> int:
-        weights = load_as(self._weights(), self.preset)
-        config = override(weights.config, dtype=self.dtype, score_threshold=self.score_threshold)
+        short = {"dtype": self.dtype, "detection.score_threshold": self.score_threshold}
+        weights = self.config_options.load(self._weights(), short)
         folder = self.data_set.find_folder()
         for out in (self.out, self.json and self.json.parent):
             if out is not None:
                 check_folder(out)
         with warnings_as_lines(folder or "simulated frames"):
             dataset = self.data_set.open(self.split, self.seed)
-            frames = detect_dataset(Detector(weights.variables, config), dataset, _with_bar)
-        evaluation = score_frames(frames)
+            frames = detect_dataset(Detector(weights.variables, weights.config), dataset, _with_bar)
+        evaluation = score_frames(frames, weights.config)
         print(format_report(evaluation))
         boxes, seconds = sum(len(frame.lines) for frame in frames), sum(frame.result.seconds for frame in frames)
         milliseconds = f"{1e3 * seconds / len(frames):.0f} ms per frame"

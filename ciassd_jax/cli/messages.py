@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
+import re
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -10,12 +12,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
+from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import DroppedWarning, FormatWarning
 
 Item = TypeVar("Item")
+# The fields of a config in messages: "section.field", with an index for those of a class or a stage.
+_SECTIONS = {one.name for one in dataclasses.fields(Config)}
+_FIELD = re.compile(rf"(?<![\w./-])({'|'.join(sorted(_SECTIONS))})((?:\[\d+\]|\.\w+)+)")
 # How the library's messages name what the program has an option or a command for.
 _OPTIONS = {
     "as `image_size` (width, height)": "with --image-size WIDTH HEIGHT",
+    "as `columns`": "with --columns",
+    "as `intensity_scale`": "with --intensity-scale",
+    "as `z_shift`": "with --z-shift",
+    "as `limits`": "with --overlap",
     "`overwrite`": "--overwrite",
     "`write_synthetic`": "`ciassd data synth`",
 }
@@ -34,12 +44,17 @@ def values_from_options() -> Iterator[None]:
         raise UsageError(str(error)) from error
 
 
-def describe(error: Exception) -> str:
-    """Return an error's sentence with the options of the program in place of the arguments of the library."""
-    text = str(error)
+def describe(message: Exception | Warning | str) -> str:
+    """Return a message of the library in terms of the program: its options for arguments and fields of the config."""
+    text = str(message)
     for argument, option in _OPTIONS.items():
         text = text.replace(argument, option)
-    return text
+    return _FIELD.sub(lambda found: f"{found[0]} ({option_of(found[0])})", text)
+
+
+def option_of(field: str) -> str:
+    """Return the option that replaces a field of the config, such as "grid.voxel_size" or "classes[0].name"."""
+    return "--config." + re.sub(r"\[(\d+)\]", r".\1", field).replace("_", "-")
 
 
 @contextmanager
@@ -63,7 +78,7 @@ def warnings_as_lines(source: Path | str) -> Iterator[None]:
     def show(message, category, *rest, **more):  # type: ignore[no-untyped-def]
         if issubclass(category, DroppedWarning | FormatWarning):
             named = message if issubclass(category, FormatWarning) else f"{source}: {message}"
-            tqdm.write(f"warning: {named}", file=sys.stderr)
+            tqdm.write(f"warning: {describe(named)}", file=sys.stderr)
         else:
             before(message, category, *rest, **more)
 

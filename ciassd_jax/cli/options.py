@@ -1,20 +1,17 @@
-"""Options that several commands share, and what they select: weights, a preset's config, labelled frames."""
+"""Options that several commands share, and the labelled frames that they select."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import tyro
 
 from ciassd_jax.cli.messages import UsageError, values_from_options
-from ciassd_jax.config import Config
-from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.data.folders import find_root, open_dataset
 from ciassd_jax.data.frames import Dataset
-from ciassd_jax.formats.errors import InputError
-from ciassd_jax.inference.weights import Weights, check_fits, find_weights, load_weights
+from ciassd_jax.formats.points import parse_columns
 from ciassd_jax.simulation import open_synthetic, split_synthetic
 
 T = TypeVar("T")
@@ -29,37 +26,18 @@ ImageSize = Annotated[
     ),
 ]
 Dtype = Literal["float32", "bfloat16"]
-if TYPE_CHECKING:
-    Preset = str
-else:
-    Preset = tyro.extras.literal_type_from_choices(PRESETS)
+Columns = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="x,y,z,intensity,ring",
+        help="The columns of the clouds by name, or their number if the first four are x, y, z and intensity.",
+        help_behavior_hint="",
+    ),
+]
 
 # In place of a folder: frames of the LiDAR simulator.
 SIMULATED = "simulated"
 SIMULATED_FRAMES = 100
-
-
-def load_as(path: Path, preset: str | None) -> Weights:
-    """Load weights from a file or by the name of bundled ones, with the preset's config if one is given."""
-    weights = load_weights(find_weights(path))
-    if preset is None:
-        return weights
-    config = PRESETS[preset]()
-    try:
-        check_fits(weights, config, path)
-    except InputError as error:
-        raise UsageError(f"--preset {preset} cannot be used: {error}") from error
-    return weights._replace(config=config)
-
-
-def override(config: Config, *, dtype: Dtype | None = None, score_threshold: float | None = None) -> Config:
-    """Return the config with the given values in place of its own."""
-    if dtype is not None:
-        config = replace(config, dtype=dtype)
-    if score_threshold is not None:
-        with values_from_options():
-            config = replace(config, detection=replace(config.detection, score_threshold=score_threshold))
-    return config
 
 
 @dataclass(frozen=True)
@@ -71,6 +49,7 @@ class Frames:
     frames: Annotated[int | None, tyro.conf.arg(help_behavior_hint=f"(default: {SIMULATED_FRAMES})")] = None
     """Number of simulated frames; every fourth is of the split val, the others of train."""
     image_size: ImageSize = None
+    columns: Columns = None
 
     def find_folder(self) -> Path | None:
         """Return the folder of the data set, None for simulated frames; raises InputError without either."""
@@ -84,7 +63,13 @@ class Frames:
         """Open the frames of a split; `seed` is that of simulated frames."""
         if self.data == SIMULATED:
             return open_simulated(split, SIMULATED_FRAMES if self.frames is None else self.frames, seed)
-        return open_dataset(self.find_folder(), split, self.image_size)
+        return open_dataset(self.find_folder(), split, self.image_size, read_columns(self.columns))
+
+
+def read_columns(text: str | None) -> int | tuple[str, ...] | None:
+    """Return the value of --columns."""
+    with values_from_options():
+        return None if text is None else parse_columns(text)
 
 
 def open_simulated(split: str, frames: int, seed: int) -> Dataset:

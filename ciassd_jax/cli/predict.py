@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import warnings_as_lines
-from ciassd_jax.cli.options import Dtype, ImageSize, Preset, Unset, load_as, override
+from ciassd_jax.cli.options import Columns, Dtype, ImageSize, Unset, read_columns
 from ciassd_jax.data.clouds import CloudFile, find_clouds
 from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.points import read_points
@@ -35,8 +36,8 @@ class Predict:
     calib: Unset[Path] = None
     """Calibration file, or a folder of them; found without this option in KITTI's layout."""
     image_size: ImageSize = None
-    preset: Unset[Preset] = None
-    """Use the config of this preset instead of the one in the weights file; the parameters must fit."""
+    columns: Columns = None
+    config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     dtype: Unset[Dtype] = None
     """Compute type of the network."""
     score_threshold: Unset[float] = None

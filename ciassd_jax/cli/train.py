@@ -10,13 +10,14 @@ from typing import Annotated, Literal
 
 import tyro
 
+from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, values_from_options, warnings_as_lines
-from ciassd_jax.cli.options import Dtype, Frames, Preset, Unset
+from ciassd_jax.cli.options import Dtype, Frames, Unset
 from ciassd_jax.config import Config, ScheduleConfig
-from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.gt_sampling import ObjectDatabase, database_path, find_database
 from ciassd_jax.data.loader import Batches, make_batches
+from ciassd_jax.data.scenes import check_targets
 from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.inference.weights import check_fits, find_weights, load_weights
@@ -26,7 +27,7 @@ from ciassd_jax.training.validation import count_found
 from ciassd_jax.types import TrainState, Variables
 
 # Overfits one frame; the running statistics of BatchNorm need the last hundreds of steps to settle.
-_OVERFIT = {"total_steps": 800, "learning_rate": 1e-3, "batch_size": 1}
+_OVERFIT = {"schedule.total_steps": 800, "schedule.learning_rate": 1e-3, "schedule.batch_size": 1}
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,7 @@ class Train:
 
     workdir: Path
     """Folder for everything that is written: config, metrics, checkpoints, evaluations, weights."""
-    preset: Preset = "car"
-    """The config to train; the options below replace single fields of it."""
+    config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     data_set: Annotated[Frames, tyro.conf.OmitArgPrefixes] = field(default_factory=Frames)
     split: str = "train"
     """The frames to train on: train, trainval, all or a file of ImageSets."""
@@ -110,6 +110,8 @@ class Train:
         elif self.validate.lower() != "none" and self.evaluate_every:
             validation = self.data_set.open(self.validate, self.seed)
         config, intervals = self._config(len(dataset)), self._intervals()
+        # Before minutes of compilation and hours of training for nothing.
+        check_targets(dataset, config)
         variables = self._variables(config)
         batches = self._batches(dataset, config, self._database(dataset, config, folder, log))
         fitted = fit(
@@ -131,20 +133,17 @@ class Train:
         return 0 if self.overfit_one is None else self._report_overfit(fitted.state, dataset, config, log)
 
     def _config(self, frames: int) -> Config:
-        """The preset's config with the fields of the schedule that are given as options."""
+        """The chosen config with the fields that are given as options."""
         if self.steps is not None and self.epochs is not None:
             raise UsageError("Give either --steps or --epochs.")
-        config = PRESETS[self.preset]()
-        names = [one.name for one in fields(ScheduleConfig)]
-        given = {name: value for name in names if (value := getattr(self, name, None)) is not None}
-        if self.overfit_one is not None:
-            given = _OVERFIT | given
-        with values_from_options():
-            schedule = replace(config.schedule, **given)
-            steps = self.steps if self.epochs is None else self.epochs * frames // schedule.batch_size
-            if steps is not None:
-                schedule = replace(schedule, total_steps=steps)
-        return replace(config, schedule=schedule, dtype=self.dtype or config.dtype)
+        given = {f"schedule.{one.name}": getattr(self, one.name, None) for one in fields(ScheduleConfig)}
+        given |= {"dtype": self.dtype, "schedule.total_steps": self.steps}
+        usual = _OVERFIT if self.overfit_one is not None else None
+        config = self.config_options.resolve(short=given, usual=usual)
+        if self.epochs is None:
+            return config
+        steps = self.epochs * frames // config.schedule.batch_size
+        return self.config_options.resolve(short=given | {"schedule.total_steps": steps}, usual=usual)
 
     def _intervals(self) -> Intervals:
         with values_from_options():
@@ -192,5 +191,5 @@ class Train:
 
     def _report_overfit(self, state: TrainState, dataset: Dataset, config: Config, log: Callable[[str], object]) -> int:
         found, targets = on_process_0(partial(count_found, state, dataset, config)) or (0, 0)
-        log(f"Frame {self.overfit_one}: {found} of {targets} objects are found at a 3D overlap of 0.7.")
+        log(f"Frame {self.overfit_one}: {found} of {targets} objects are found at the strict overlap of their class.")
         return 0 if found == targets else 1

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
-from ciassd_jax.cli.options import SIMULATED, ImageSize, Unset, load_as, open_simulated
+from ciassd_jax.cli.options import SIMULATED, Columns, ImageSize, Unset, open_simulated, read_columns
 from ciassd_jax.formats.errors import FormatWarning, InputError
 from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.writing import check_folder
@@ -45,6 +46,8 @@ class View:
     image: bool = False
     """Also show the camera's image, with the boxes projected into it."""
     image_size: ImageSize = None
+    columns: Columns = None
+    config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 
     def run(self) -> int:
         self._check()
@@ -77,7 +80,7 @@ class View:
         sources = self._choose(self._sources())
         if self.image and not any(source.image for source in sources.values()):
             raise UsageError(f"{self.path} has no images; leave out --image.")
-        weights = load_as(self.weights, None) if self.weights else None
+        weights = self.config_options.load(self.weights) if self.weights else None
         frames = [read_source(sources[name], image=self.image) for name in frames_with_bar(list(sources))]
         if weights is not None:
             detector = Detector(weights.variables, weights.config)

@@ -53,19 +53,23 @@ class Config:
             raise ValueError(f"dtype: {self.dtype!r} is unknown; choose 'float32', 'bfloat16' or 'float64'.")
         if self.program not in ("auto", "cpu", "accelerator"):
             raise ValueError(f"program: {self.program!r} is unknown; choose 'auto', 'cpu' or 'accelerator'.")
-        multiple = 2 * self.backbone.stride
-        for axis, cells in zip("xy", self.grid.cells, strict=False):
+        self._check_grid()
+
+    def _check_grid(self) -> None:
+        """Raise ValueError for a grid that the network cannot halve down to whole BEV cells and at least one layer."""
+        multiple, grid = 2 * self.backbone.stride, self.grid
+        for axis, cells, low, size in zip("xy", grid.cells, grid.minimum, grid.voxel_size, strict=False):
             if cells % multiple:
                 below = cells // multiple * multiple
+                valid = " or ".join(f"{low + n * size:g}" for n in (below, below + multiple) if n)
                 raise ValueError(
-                    f"grid.{axis}: {cells} voxels are not divisible by {multiple} ({self.backbone.stride} voxels "
-                    f"per BEV cell, and the neck halves the map); the nearest valid count is "
-                    f"{f'{below} or ' if below else ''}{below + multiple}."
+                    f"grid.maximum along {axis}: {cells} voxels are not divisible by {multiple} ({self.backbone.stride} "
+                    f"voxels per BEV cell, and the neck halves the map); the nearest valid maximum is {valid}."
                 )
-        depths = [shape[0] for shape in self.backbone.stage_shapes(self.grid.shape)]
+        depths = [shape[0] for shape in self.backbone.stage_shapes(grid.shape)]
         if depths[-1] < 1:
             raise ValueError(
-                f"grid.z: {self.grid.cells[2]} voxels shrink to {' -> '.join(map(str, depths))} layers; "
+                f"grid.maximum along z: {grid.cells[2]} voxels shrink to {' -> '.join(map(str, depths))} layers; "
                 "use smaller voxels, a taller range or fewer stages."
             )
 

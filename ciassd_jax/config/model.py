@@ -43,14 +43,14 @@ class GridConfig:
         for axis, low, high, size in zip("xyz", self.minimum, self.maximum, self.voxel_size, strict=True):
             if not (size > 0 and 0 < high - low < math.inf):
                 raise ValueError(
-                    f"grid.{axis}: range {low}..{high} with voxel size {size} is empty or "
+                    f"grid.minimum to grid.maximum along {axis}: range {low}..{high} with voxel size {size} is empty or "
                     "unbounded; the maximum must exceed the minimum, both must be finite, and the voxel size positive."
                 )
             cells = (high - low) / size
             if round(cells) < 1 or abs(cells - round(cells)) > 1e-3:
                 raise ValueError(
-                    f"grid.{axis}: {high - low:g} m is {cells:.3f} voxels of {size} m, not a whole number; "
-                    f"the nearest valid maximum is {low + max(round(cells), 1) * size:g}."
+                    f"grid.maximum along {axis}: {high - low:g} m is {cells:.3f} voxels of {size} m, not a whole "
+                    f"number; the nearest valid maximum is {low + max(round(cells), 1) * size:g}."
                 )
         if self.max_points_per_voxel < 1 or self.max_voxels < 1:
             raise ValueError("grid: max_points_per_voxel and max_voxels must be at least 1.")

@@ -28,6 +28,7 @@ from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.gt_sampling import ObjectDatabase, no_objects, sample_objects
 from ciassd_jax.data.scenes import pad_frame
 from ciassd_jax.data.workers import Watched
+from ciassd_jax.formats.points import check_intensity
 from ciassd_jax.types import Array, SampledObjects, Scene
 
 # Batches prepared ahead on the device, and in each worker or in the reading thread.
@@ -72,7 +73,8 @@ class Stream:
         epoch, place = divmod(position, len(self.dataset))
         index = int(epoch_order(self.seed, epoch, len(self.dataset))[place])
         frame = self.dataset.read(index)
-        scene = pad_frame(frame, index, self.config)
+        points, _ = check_intensity(frame.points, self.config.input.intensity_scale, f"Frame {frame.name}")
+        scene = pad_frame(frame._replace(points=points), index, self.config)
         return HostScene(scene, self._sample(frame.names, epoch, index), np.array(epoch, np.int32))
 
     def _sample(self, names: tuple[str, ...], epoch: int, index: int) -> SampledObjects | None:

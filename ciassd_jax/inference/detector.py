@@ -13,13 +13,14 @@ import jax
 import numpy as np
 
 from ciassd_jax.config import Config
-from ciassd_jax.formats.errors import DroppedWarning
-from ciassd_jax.formats.points import scale_intensity
+from ciassd_jax.formats.errors import DroppedWarning, Pathlike
+from ciassd_jax.formats.points import check_intensity
 from ciassd_jax.inference.predict import compile_predict
 from ciassd_jax.inference.results import FrameResult, frame_result
 from ciassd_jax.inference.weights import find_weights, load_weights
 from ciassd_jax.model.network import variables_of
 from ciassd_jax.ops.camera import ANYWHERE
+from ciassd_jax.ops.voxelize import MAX_INTENSITY
 from ciassd_jax.types import Array, PointCloud, Variables
 
 # Clouds are padded to this number of points, or to 4, 16, ... times as many.
@@ -44,35 +45,43 @@ class Detector:
         return cls(weights.variables, weights.config)
 
     @overload
-    def __call__(self, points: Array, *, frustum: np.ndarray | None = None) -> FrameResult: ...
+    def __call__(self, points: Array, *, frustum: np.ndarray | None = None, source: Pathlike = ...) -> FrameResult: ...
 
     @overload
-    def __call__(self, points: Sequence[Array], *, frustum: np.ndarray | None = None) -> list[FrameResult]: ...
+    def __call__(
+        self, points: Sequence[Array], *, frustum: np.ndarray | None = None, source: Pathlike = ...
+    ) -> list[FrameResult]: ...
 
     def __call__(
-        self, points: Array | Sequence[Array], *, frustum: np.ndarray | None = None
+        self, points: Array | Sequence[Array], *, frustum: np.ndarray | None = None, source: Pathlike = "The cloud"
     ) -> FrameResult | list[FrameResult]:
         """Detect objects in points [N, 4] (x, y, z in metres, intensity), or in each of a list of clouds.
 
-        `frustum` [6, 4] (`ops.camera.frustum_planes`) drops boxes outside the camera's view. Intensities of 0..255 are
-        divided by 255. Warns of that, and of points, voxels, sites and candidates that were dropped. Raises ValueError
-        for points of another shape.
+        `frustum` [6, 4] (`ops.camera.frustum_planes`) drops boxes outside the camera's view. Intensities lie between 0
+        and `config.input.intensity_scale`; single ones outside are clipped. Warns of these, and of points, voxels,
+        sites and candidates that were dropped; `source` names the cloud in errors. Raises InputError if many
+        intensities lie outside, and ValueError for points of another shape.
         """
-        detect = partial(self._detect, frustum=frustum)
+        detect = partial(self._detect, frustum=frustum, source=source)
         if isinstance(points, np.ndarray | jax.Array):
             return detect(points)
         # Unlike a comprehension, `map` adds no frame, so warnings point to the caller's line.
         return list(map(detect, points))
 
-    def _detect(self, points: Array, *, frustum: np.ndarray | None) -> FrameResult:
-        points = _check_points(np.asarray(points))
+    def _detect(self, points: Array, *, frustum: np.ndarray | None, source: Pathlike) -> FrameResult:
+        points, clipped = check_intensity(_check_shape(points), self.config.input.intensity_scale, source)
         program = self.compile(len(points))
         start = time.perf_counter()
         planes = ANYWHERE if frustum is None else np.asarray(frustum, np.float32)
         batch = jax.device_get(program(self._variables, pad_to_bucket(points), frustum=planes[None]))
-        result = frame_result(batch, self.config, time.perf_counter() - start)
-        _warn_of_drops(result.counts, int((~np.isfinite(points).all(1)).sum()))
+        result = frame_result(batch, self.config, time.perf_counter() - start, clipped=clipped)
+        _warn_of_drops(result.counts, self._count_invalid(points))
         return result
+
+    def _count_invalid(self, points: np.ndarray) -> int:
+        """The points that the voxelisation drops whatever its capacity."""
+        most = MAX_INTENSITY * self.config.input.intensity_scale
+        return int((~(np.isfinite(points).all(1) & (np.abs(points[:, 3]) <= most))).sum())
 
     def compile(self, num_points: int) -> jax.stages.Compiled:
         """Return the program for clouds of up to `num_points` points, compiled on first use."""
@@ -94,32 +103,27 @@ def pad_to_bucket(points: np.ndarray) -> PointCloud:
     return PointCloud(padded, np.array([len(points)], np.int32))
 
 
-def _check_points(points: np.ndarray) -> np.ndarray:
-    """Return points as float32 [N, 4] with intensity in [0, 1]."""
+def _check_shape(points: Array) -> np.ndarray:
+    """Return points [N, 4] as float32."""
     if points.ndim != 2 or points.shape[1] != 4:
         raise ValueError(f"points have the shape {points.shape}; give [N, 4]: x, y, z in metres and intensity.")
-    points, top = scale_intensity(np.asarray(points, np.float32))
-    if top is not None:
-        warnings.warn(
-            f"{len(points)} intensities of up to {top:g} were divided by 255: the network reads [0, 1].",
-            DroppedWarning,
-            stacklevel=4,
-        )
-    return points
+    return np.asarray(points, np.float32)
 
 
-def _warn_of_drops(counts: dict[str, Any], not_finite: int) -> None:
-    """Warn once of everything that was dropped, if anything was."""
+def _warn_of_drops(counts: dict[str, Any], invalid: int) -> None:
+    """Warn once of everything that was clipped or dropped, if anything was."""
     lost = []
     points, voxels = counts["points"], counts["voxels"]
-    if not_finite:
-        lost.append(f"{not_finite} of {points['given']} points that are not finite")
+    if points["clipped"]:
+        lost.append(f"the excess of {points['clipped']} of {points['given']} intensities outside their range")
+    if invalid:
+        lost.append(f"{invalid} of {points['given']} points that are not finite or have an impossible intensity")
     if not points["in_range"]:
         lost.append(f"all {points['given']} points, none of which is in range")
     if voxels["dropped"]:
         lost.append(
             f"{voxels['dropped']} voxels beyond the {voxels['kept']} that fit (grid.max_voxels), with "
-            f"{points['dropped'] - not_finite} points"
+            f"{points['dropped'] - invalid} points"
         )
     lost += [
         f"{stage['dropped']} sites of backbone stage {i + 1} beyond the {stage['kept']} that fit (its capacity)"

@@ -90,14 +90,16 @@ class FrameResult:
         }
 
 
-def frame_result(batch: Detections, config: Config, seconds: float) -> FrameResult:
-    """Return the detections of a batch of one scene, which took `seconds`, as NumPy arrays."""
+def frame_result(batch: Detections, config: Config, seconds: float, *, clipped: int = 0) -> FrameResult:
+    """Return the detections of a batch of one scene as NumPy arrays.
+
+    They took `seconds`, and `clipped` of its intensities were clipped before.
+    """
     scene = jax.tree.map(lambda leaf: np.asarray(leaf[0]), batch)
     count = int(scene.count)
     labels = tuple(config.class_names[label] for label in scene.label[:count])
-    return FrameResult(
-        scene.boxes.to_array()[:count], scene.score[:count], labels, _plain_counts(scene.counts), seconds
-    )
+    counts = _plain_counts(scene.counts, clipped)
+    return FrameResult(scene.boxes.to_array()[:count], scene.score[:count], labels, counts, seconds)
 
 
 def write_result(result: FrameResult, name: str, folder: Pathlike, camera: Camera | None = None) -> list[Path]:
@@ -117,15 +119,15 @@ def write_result(result: FrameResult, name: str, folder: Pathlike, camera: Camer
 def write_json(path: Path, result: FrameResult) -> Path:
     """Write one result as JSON, whole or not at all; return the path."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(result.to_dict()) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(result.to_dict(), allow_nan=False) + "\n", encoding="utf-8")
     return path
 
 
-def _plain_counts(counts: Counts) -> dict[str, Any]:
+def _plain_counts(counts: Counts, clipped: int) -> dict[str, Any]:
     """Return the counts of one scene as nested plain numbers."""
     value = {name: np.asarray(leaf).tolist() for name, leaf in counts._asdict().items()}
     return {
-        "points": {name: value[f"points_{name}"] for name in ("given", "in_range", "dropped")},
+        "points": {name: value[f"points_{name}"] for name in ("given", "in_range", "dropped")} | {"clipped": clipped},
         "voxels": {name: value[f"voxels_{name}"] for name in ("kept", "dropped")},
         "sites": [
             {"kept": kept, "dropped": dropped}

@@ -20,6 +20,7 @@ import safetensors.numpy
 
 from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import InputError
+from ciassd_jax.formats.lines import read_text
 from ciassd_jax.formats.torch_file import read_torch_file
 from ciassd_jax.formats.writing import replacing
 from ciassd_jax.inference.released_weights import (
@@ -65,16 +66,25 @@ def load_weights(path: str | os.PathLike[str]) -> Weights:
     if Path(path).suffix != ".safetensors":
         return _load_released(read_torch_file(path), path)
     tensors, metadata = _read_safetensors(path)
-    if "config" not in metadata:
-        raise InputError(
-            f"{path} has no config in its metadata; convert it with `ciassd convert {path} OUT.safetensors` and use "
-            "the new file."
-        )
-    try:
-        config = Config.from_json(metadata["config"])
-    except ValueError as error:
-        raise InputError(f"{path} was written for another version of the package: {error}") from error
-    return _assemble(tensors, {name: (name, ()) for name in tensors}, config, path)
+    return _assemble(tensors, {name: (name, ()) for name in tensors}, _config_in(metadata, path), path)
+
+
+def read_config(path: str | os.PathLike[str]) -> Config:
+    """Read the config of a weights file, or a JSON file of `Config.to_json`.
+
+    Raises InputError for a file without a valid config.
+    """
+    suffix = Path(path).suffix
+    if suffix == ".json":
+        try:
+            return Config.from_json(read_text(path))
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{path} is not a config: {error}") from error
+    if suffix != ".safetensors":
+        return load_weights(path).config
+    return _config_in(_read_safetensors(path)[1], path)
 
 
 def load_released_weights(path: str | os.PathLike[str]) -> Weights:
@@ -146,6 +156,18 @@ def _read_safetensors(path: str | os.PathLike[str]) -> tuple[Tensors, dict[str, 
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (safetensors.SafetensorError, OSError) as error:
         raise InputError(f"{path} is not a complete safetensors file ({error}); download or write it again.") from error
+
+
+def _config_in(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> Config:
+    if "config" not in metadata:
+        raise InputError(
+            f"{path} has no config in its metadata; convert it with `ciassd convert {path} OUT.safetensors` and use "
+            "the new file."
+        )
+    try:
+        return Config.from_json(metadata["config"])
+    except ValueError as error:
+        raise InputError(f"{path} was written for another version of the package: {error}") from error
 
 
 def _load_released(content: Mapping[str, Any], path: str | os.PathLike[str]) -> Weights:

@@ -16,7 +16,7 @@ from ciassd_jax.types import Array, PointCloud, SparseVoxels
 
 Vector = tuple[float, float, float]
 # A larger intensity comes from a damaged file, and one such point would spoil the whole scene.
-_MAX_INTENSITY = 1e3
+MAX_INTENSITY = 1e3
 
 
 def voxel_coordinates(
@@ -66,17 +66,16 @@ def voxelize(
 ) -> SparseVoxels:
     """Group points into voxels and average the first `max_points` of each, in the order of the cloud.
 
-    Points outside the grid of `cells` (x, y, z) are ignored, and so are points that are not finite or have an intensity
-    beyond 1000; the latter are counted as dropped. Over capacity, the
-    `max_voxels` voxels that the cloud touches first are kept; "stop" also ignores every point after the one that
-    exceeds the capacity, as the released code does. `shape` (z, y, x) defines the linear keys and may have more layers
-    than `cells`.
+    Points outside the grid of `cells` (x, y, z) are ignored. Points that are not finite or have an intensity beyond
+    1000 are dropped and counted. Over capacity, the `max_voxels` voxels that the cloud touches first are kept; "stop"
+    also ignores every point after the one that exceeds the capacity, as the released code does. `shape` (z, y, x)
+    defines the linear keys and may have more layers than `cells`.
     """
     capacity = cloud.points.shape[0]
     slots = jnp.arange(capacity, dtype=jnp.int32)
     coordinates, inside = voxel_coordinates(cloud.points[:, :3], minimum=minimum, voxel_size=voxel_size, cells=cells)
     given = slots < cloud.count
-    finite = jnp.isfinite(cloud.points).all(-1) & (jnp.abs(cloud.points[:, 3]) <= _MAX_INTENSITY)
+    finite = jnp.isfinite(cloud.points).all(-1) & (jnp.abs(cloud.points[:, 3]) <= MAX_INTENSITY)
     inside &= given & finite
     keys = jnp.where(inside, linear_keys(coordinates, shape), NO_SITE)
     # A stable sort keeps the order of the cloud within a voxel.

@@ -1,0 +1,158 @@
+"""The config that a command uses: a preset's, a file's or that of weights, with fields replaced by options.
+
+`--config.SECTION.FIELD VALUE` replaces any field. These options are parsed before the others, because their defaults
+and the number of classes and stages are those of the chosen config.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import tyro
+
+from ciassd_jax.cli.messages import UsageError, option_of, values_from_options
+from ciassd_jax.cli.options import Unset
+from ciassd_jax.config import Config
+from ciassd_jax.config.presets import PRESETS
+from ciassd_jax.formats.errors import InputError
+from ciassd_jax.inference.scoring import find_trained
+from ciassd_jax.inference.weights import Weights, check_fits, find_weights, load_weights, read_config
+
+if TYPE_CHECKING:
+    Preset = str
+else:
+    Preset = tyro.extras.literal_type_from_choices(PRESETS)
+
+
+class Replaced(NamedTuple):
+    """A config in which options of the form --config.SECTION.FIELD replaced the fields `names`, "section.field"."""
+
+    config: Config
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ConfigOptions:
+    """The options that choose a config."""
+
+    preset: Unset[Preset] = None
+    """Use the config of this preset. With weights, the parameters must fit."""
+    config: Unset[Path] = None
+    """Or that of a file: a config.json or weights. --config.SECTION.FIELD VALUE replaces a field (--help-config)."""
+    intensity_scale: Unset[float] = None
+    """The intensity in the clouds that the network reads as 1, such as 255. Training keeps it with the weights."""
+    z_shift: Unset[float] = None
+    """Metres that the network adds to z, if the sensor stands at another height. Training keeps it too."""
+    replaced: tyro.conf.Suppress[tyro.conf.Fixed[Replaced | None]] = None
+
+    def resolve(
+        self,
+        own: Config | None = None,
+        short: Mapping[str, Any] | None = None,
+        usual: Mapping[str, Any] | None = None,
+    ) -> Config:
+        """Return the chosen config, by default `own` or else the paper's, with fields replaced by options.
+
+        `short` are the command's own options as "section.field" to value; those that are None were not given. `usual`
+        are values that the command prefers to the config's, and any option to them.
+        """
+        config, names = self.replaced or (self.chosen(own), ())
+        options = {"input.intensity_scale": self.intensity_scale, "input.z_shift": self.z_shift, **(short or {})}
+        given = {name: value for name, value in options.items() if value is not None}
+        for name in given.keys() & set(names):
+            raise UsageError(f"{option_of(name)} sets a field that another option sets too; give one of the two.")
+        preferred = {name: value for name, value in (usual or {}).items() if name not in names}
+        with values_from_options():
+            for name, value in (preferred | given).items():
+                config = _replace_field(config, name, value)
+        return config
+
+    def chosen(self, own: Config | None = None) -> Config:
+        """Return the config before single fields are replaced."""
+        if self.preset is not None and self.config is not None:
+            raise UsageError("--preset and --config both choose a config; give one of them.")
+        if self.preset is not None:
+            return PRESETS[self.preset]()
+        if self.config is not None:
+            return read_config(self.config)
+        return own or Config()
+
+    def load(self, path: Path, short: Mapping[str, Any] | None = None) -> Weights:
+        """Load weights from a file or by the name of bundled ones, with the chosen config, by default their own."""
+        weights = load_weights(find_weights(path))
+        config = self.resolve(weights.config, short)
+        try:
+            check_fits(weights, config, path)
+        except InputError as error:
+            raise UsageError(f"The options choose another config: {error}") from error
+        return weights._replace(config=config)
+
+
+def _replace_field(config: Config, name: str, value: object) -> Config:
+    """Return the config with the field "section.field" or "field" replaced."""
+    section, _, field = name.rpartition(".")
+    if not section:
+        return dataclasses.replace(config, **{name: value})
+    part = dataclasses.replace(getattr(config, section), **{field: value})
+    return dataclasses.replace(config, **{section: part})
+
+
+@dataclass(frozen=True)
+class _Fields:
+    """Every field of a config as an option."""
+
+    config: Config
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The options that name a config."""
+
+    preset: Unset[Preset] = None
+    config: Unset[Path] = None
+    weights: Unset[Path] = None
+    workdir: Unset[Path] = None
+
+
+def take_fields(arguments: Sequence[str]) -> tuple[Replaced | None, list[str]]:
+    """Parse the options --config.SECTION.FIELD; return the config with these fields, and the other arguments."""
+    names = [argument.partition("=")[0] for argument in arguments if argument.startswith("--config.")]
+    if not names:
+        return None, list(arguments)
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated:
+        raise UsageError(f"{repeated} is given twice; give it once.")
+    fields, others = tyro.cli(
+        _Fields,
+        prog="ciassd",
+        default=_Fields(_source(arguments)),
+        args=list(arguments),
+        return_unknown_args=True,
+        add_help=False,
+    )
+    unknown = next((argument for argument in others if argument.startswith("--config.")), None)
+    if unknown:
+        raise UsageError(f"{unknown} is no field of this config; --help-config lists the fields.")
+    return Replaced(fields.config, tuple(name[9:].replace("-", "_") for name in names)), others
+
+
+def print_fields(arguments: Sequence[str]) -> None:
+    """Print every field of the chosen config with its value, as help."""
+    tyro.cli(_Fields, prog="ciassd", default=_Fields(_source(arguments)), args=["--help"])
+
+
+def _source(arguments: Sequence[str]) -> Config:
+    """Return the config that the arguments of a command name."""
+    named = tyro.cli(_Source, args=list(arguments), return_unknown_args=True, add_help=False)[0]
+    weights = named.weights
+    if arguments[0] == "eval" and named.workdir is not None:
+        weights = find_trained(named.workdir)
+    if arguments[0] == "demo" and weights is None:
+        weights = Path("car_lite")
+    chosen = ConfigOptions(named.preset, named.config)
+    own = read_config(find_weights(weights)) if weights and not (named.preset or named.config) else None
+    return chosen.chosen(own)
