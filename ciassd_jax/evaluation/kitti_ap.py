@@ -13,13 +13,24 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from ciassd_jax.config import Config
+from ciassd_jax.data.frames import difficulty_by_points
 from ciassd_jax.evaluation.matching import Pairs, assign, order_pairs, pick_thresholds
-from ciassd_jax.evaluation.objects import DetectedObjects, FlatObjects, LabelledObjects, flatten, select
+from ciassd_jax.evaluation.objects import (
+    DetectedObjects,
+    FlatObjects,
+    LabelledObjects,
+    flatten,
+    has_image_box,
+    select,
+    without_image,
+)
 from ciassd_jax.evaluation.overlap import Geometry, Intersections, intersect
-from ciassd_jax.formats.kitti_rows import DIFFICULTIES
+from ciassd_jax.formats.kitti_rows import DIFFICULTIES, DONT_CARE
 
 Metric = Literal["bbox", "bev", "3d", "aos"]
 Recall = Literal["R11", "R40"]
+# What difficulty is: KITTI's, the number of points in a box, or the same for all, so that every label is easy.
+Difficulty = Literal["kitti", "points", "none"]
 # The overlaps that detections of each class must exceed, the strict one first. Case does not matter in names.
 Limits = Mapping[str, tuple[float, ...]]
 METRICS: tuple[Metric, ...] = ("bbox", "bev", "3d", "aos")
@@ -57,13 +68,9 @@ class Evaluand(NamedTuple):
 
     truths: FlatObjects
     detections: FlatObjects
+    difficulty: Difficulty
     shared: dict[Geometry, Intersections]
     dont_care: dict[Geometry, Intersections]
-
-    @property
-    def has_camera(self) -> bool:
-        """Whether the objects have image boxes; true if there are no labels."""
-        return bool(np.isfinite(self.truths.image_boxes).all())
 
 
 class Within(NamedTuple):
@@ -79,8 +86,17 @@ def limits_of(config: Config) -> Limits:
     return {one.name: official.get(one.name.lower(), (one.eval_overlap,)) for one in config.classes}
 
 
+def check_limits(limits: Limits) -> None:
+    """Raise ValueError for limits that are no overlaps, and for a class that is named twice."""
+    for name, of_class in limits.items():
+        if not of_class or not all(0 < limit < 1 for limit in of_class):
+            raise ValueError(f"limits: {of_class} of {name} should be overlaps between 0 and 1.")
+    if len({name.lower() for name in limits}) < len(limits):
+        raise ValueError(f"limits: {', '.join(limits)} name a class twice; case does not matter.")
+
+
 def prepare(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObjects]) -> Evaluand:
-    """Join frames and intersect their objects.
+    """Join frames and intersect their objects; image boxes count only if at least one label has one.
 
     Raises ValueError for lists of different length, and if only one of them has a camera.
     """
@@ -90,8 +106,13 @@ def prepare(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObje
     cameras = {bool(np.isfinite(objects.image_boxes).all()) for objects in (labels, found) if len(objects.frame)}
     if len(cameras) > 1:
         raise ValueError("only labels or only detections have image boxes; give both or neither.")
-    areas = select(labels, labels.types == "dontcare")
-    return Evaluand(labels, found, intersect(labels, found), intersect(areas, found))
+    difficulty: Difficulty = "kitti"
+    is_area = labels.types == DONT_CARE.lower()
+    if not is_area.all() and not has_image_box(labels)[~is_area].any():
+        labels, difficulty = _grade_without_image(labels)
+        found = without_image(found)
+    areas = select(labels, is_area)
+    return Evaluand(labels, found, difficulty, intersect(labels, found), intersect(areas, found))
 
 
 def is_evaluated(detections: FlatObjects, name: str, metric: Metric) -> bool:
@@ -157,6 +178,17 @@ def possible_precision(num_truths: int) -> float:
     """Return the AP R40 of this number of objects if all are found with one score and nothing else is."""
     thresholds = pick_thresholds(np.ones(num_truths), num_truths)
     return average_precision(np.where(np.arange(CURVE_POINTS) < len(thresholds), 1.0, 0.0))
+
+
+def _grade_without_image(labels: FlatObjects) -> tuple[FlatObjects, Difficulty]:
+    """Return labels without image boxes, with a difficulty that needs none, and its kind."""
+    if np.isnan(labels.image_boxes).all():
+        # Data without a camera, which has its own difficulty.
+        return labels, "points"
+    labels = without_image(labels)
+    if (labels.points >= 0).all():
+        return labels._replace(difficulty=difficulty_by_points(labels.points)), "points"
+    return labels._replace(difficulty=np.zeros_like(labels.difficulty)), "none"
 
 
 class _Case(NamedTuple):

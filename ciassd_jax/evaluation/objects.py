@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.formats.errors import InputError
@@ -23,7 +23,8 @@ class LabelledObjects(NamedTuple):
 
     `difficulty` is an index in formats.kitti_rows.DIFFICULTIES or -1. `boxes` are in any right-handed frame with z up
     whose origin is the sensor. `image_boxes` (x1, y1, x2, y2) in pixels and `alpha` in radians are None for data
-    without a camera; `points`, the number of points in each box, is None if unknown.
+    without a camera; `points`, the number of points in each box, is None if unknown. If no label of a data set has an
+    image box with an area, it is evaluated without a camera, and difficulty is by `points`.
     """
 
     types: tuple[str, ...]
@@ -115,6 +116,18 @@ def select(objects: FlatObjects, index: np.ndarray) -> FlatObjects:
     """Return the objects at an index or mask."""
     boxes = Boxes(*(leaf[index] for leaf in objects.boxes))
     return FlatObjects._make(boxes if field is objects.boxes else field[index] for field in objects)
+
+
+def has_image_box(objects: FlatObjects) -> Bool[np.ndarray, " O"]:
+    """Return which objects have an image box with an area."""
+    return np.all(objects.image_boxes[:, 2:] > objects.image_boxes[:, :2], axis=1)
+
+
+def without_image(objects: FlatObjects) -> FlatObjects:
+    """Return the objects as those of data without a camera."""
+    return objects._replace(
+        image_boxes=np.full_like(objects.image_boxes, np.nan), alpha=np.full_like(objects.alpha, np.nan)
+    )
 
 
 def _geometry(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from ciassd_jax.evaluation.breakdown import Row
 from ciassd_jax.evaluation.kitti_ap import CURVE_POINTS, METRICS, Metric, Recall, average_precision
-from ciassd_jax.evaluation.summary import Evaluation
+from ciassd_jax.evaluation.summary import Counts, Evaluation
 from ciassd_jax.formats.kitti_rows import DIFFICULTIES
 
 # Keys are class, metric, R11 or R40, and limit of overlap.
@@ -63,15 +63,20 @@ def format_tables(evaluation: Evaluation) -> str:
     parts = [_main_table(evaluation)]
     for title, rows in (("distance", evaluation.by_distance), ("number of points", evaluation.by_points)):
         if rows:
-            parts.append("\n".join([f"By {title}, AP (R40)", _HEAD_OF_PARTS, *map(_part_line, rows)]))
+            parts.append(f"By {title}, AP (R40)\n{_align([_HEAD_OF_PARTS, *map(_part_line, rows)])}")
     known = [f"{name} {value:.3f}" for name, value in evaluation.correlation.items() if not math.isnan(value)]
     if known:
         parts.append(f"Correlation (PCC) of confidence and 3D overlap: {', '.join(known)}.")
     return "\n\n".join(parts + list(_notes(evaluation)))
 
 
-_HEAD = f"{'class':<12}{'metric':<8}{'overlap':>7}" + f"{'R40':>6}{_LEVELS}{'R11':>6}{_LEVELS}"
-_HEAD_OF_PARTS = f"{'class':<12}{'metric':<8}{'part':>14}{_LEVELS}{'objects':>10}{_LEVELS}"
+_HEAD = "class", f"{'metric':<8}{'overlap':>7}{'R40':>6}{_LEVELS}{'R11':>6}{_LEVELS}"
+_HEAD_OF_PARTS = "class", f"{'metric':<8}{'part':>14}{_LEVELS}{'objects':>10}{_LEVELS}"
+# What difficulty is without KITTI's.
+_DIFFICULTY = {
+    "points": "difficulty is by the number of points in an object's box",
+    "none": "every label counts at every level, as the points in the boxes are not known here",
+}
 
 
 def _block_lines(evaluation: Evaluation, name: str, limit: float, recall: Recall) -> Iterable[str]:
@@ -85,28 +90,34 @@ def _block_lines(evaluation: Evaluation, name: str, limit: float, recall: Recall
 
 
 def _main_table(evaluation: Evaluation) -> str:
-    lines = [f"AP in percent by KITTI's rules, frames: {evaluation.num_frames}", _HEAD]
+    lines = [_HEAD]
     for name, limits in evaluation.limits.items():
         rows = [
-            _main_line(evaluation, name, metric, limit)
+            (name, _main_line(evaluation, name, metric, limit))
             for limit in limits
             for metric in METRICS
             if evaluation.curves.get((name, metric, limit)) is not None
         ]
-        lines += rows or [f"{name:<12}not evaluated, as no detection of it has what a metric needs"]
-    return "\n".join(lines)
+        lines += rows or [(name, "not evaluated, as no detection of it has what a metric needs")]
+    return f"AP in percent by KITTI's rules, frames: {evaluation.num_frames}\n{_align(lines)}"
 
 
 def _main_line(evaluation: Evaluation, name: str, metric: Metric, limit: float) -> str:
     r40, r11 = (_columns(evaluation.precision(name, metric, limit, recall) or []) for recall in ("R40", "R11"))
-    return f"{name:<12}{metric:<8}{limit:>7.2f}{'':6}{r40}{'':6}{r11}"
+    return f"{metric:<8}{limit:>7.2f}{'':6}{r40}{'':6}{r11}"
 
 
-def _part_line(row: Row) -> str:
+def _part_line(row: Row) -> tuple[str, str]:
     # Without objects there is no AP, rather than one of 0.
     values = [average_precision(curve.precision) if curve.num_truths else math.nan for curve in row.curves]
     counts = "".join(f"{curve.num_truths:>10}" for curve in row.curves)
-    return f"{row.name:<12}{row.geometry:<8}{row.part:>14}{_columns(values)}{'':10}{counts}"
+    return row.name, f"{row.geometry:<8}{row.part:>14}{_columns(values)}{'':10}{counts}"
+
+
+def _align(lines: Sequence[tuple[str, str]]) -> str:
+    """Return lines of a class and what is said of it, with the first column as wide as its longest name."""
+    width = max(12, *(len(name) + 2 for name, _ in lines))
+    return "\n".join(f"{name:<{width}}{text}" for name, text in lines)
 
 
 def _columns(values: Iterable[float]) -> str:
@@ -114,12 +125,23 @@ def _columns(values: Iterable[float]) -> str:
 
 
 def _notes(evaluation: Evaluation) -> Iterable[str]:
+    if evaluation.left_out:
+        parts = (_phrase(counts) + f" of {name}" for name, counts in evaluation.left_out.items())
+        yield f"Not evaluated: {', '.join(parts)}."
+    total, unboxed = evaluation.total, evaluation.without_image_box
     if not evaluation.has_camera:
         yield (
-            "No camera: difficulty is by the number of points in an object's box, no detection is too low, and bbox "
-            "and aos are not evaluated; these are not KITTI's numbers."
+            f"None of the {total.labels} labels has an image box, so none has KITTI's difficulty: "
+            f"{_DIFFICULTY[evaluation.difficulty]}, no detection is too low, and bbox and aos are not evaluated; these "
+            "are not KITTI's numbers."
         )
-    elif all(evaluation.curves[name, "aos", limits[0]] is None for name, limits in evaluation.limits.items()):
+    elif unboxed.labels:
+        yield f"{unboxed.labels} of {total.labels} labels have no image box, so no difficulty: they do not count."
+    if evaluation.has_camera and unboxed.detections:
+        yield f"{unboxed.detections} of {total.detections} detections have no image box: too low, they do not count."
+    if evaluation.has_camera and all(
+        evaluation.curves[name, "aos", limits[0]] is None for name, limits in evaluation.limits.items()
+    ):
         yield "Orientation (aos) is not evaluated, as a detection has alpha -10 or none is in the image."
     if not evaluation.by_points:
         yield "Nothing by number of points, as the points in the boxes are not known here."
@@ -135,3 +157,9 @@ def _counts(evaluation: Evaluation) -> Iterable[int]:
     shown = [curves for curves in evaluation.curves.values() if curves is not None]
     shown += [row.curves for row in evaluation.by_distance + evaluation.by_points]
     return (curve.num_truths for curves in shown for curve in curves)
+
+
+def _phrase(counts: Counts) -> str:
+    """Return "2 labels and 1 detection", without what there is none of."""
+    parts = zip(counts, ("label", "detection"), strict=True)
+    return " and ".join(f"{number} {what}{'s' * (number != 1)}" for number, what in parts if number)
