@@ -61,7 +61,7 @@ def score_settings(
     variables: Variables, config: Config, settings: Mapping[str, DetectionConfig], dataset: Dataset
 ) -> dict[str, Evaluation]:
     """Evaluate each setting of the post-processing on the same raw predictions."""
-    return _evaluate([_score(one, config, settings) for one in _predictions(variables, config, dataset)])
+    return _evaluate([_score(one, config, settings) for one in _predictions(variables, config, dataset)], config)
 
 
 def decode_all(variables: Variables, config: Config, dataset: Dataset) -> DecodedBoxes:
@@ -77,7 +77,7 @@ def score_and_decode(
     for one in _predictions(variables, config, dataset):
         scored.append(_score(one, config, settings))
         decoded.append(_decode(one, config))
-    return _evaluate(scored), _join(decoded)
+    return _evaluate(scored, config), _join(decoded)
 
 
 def _predictions(variables: Variables, config: Config, dataset: Dataset) -> Iterator[Predicted]:
@@ -100,12 +100,12 @@ def _score(one: Predicted, config: Config, settings: Mapping[str, DetectionConfi
     return scored
 
 
-def _evaluate(frames: Sequence[Mapping[str, Scored]]) -> dict[str, Evaluation]:
+def _evaluate(frames: Sequence[Mapping[str, Scored]], config: Config) -> dict[str, Evaluation]:
     scored = {name: [frame[name] for frame in frames] for name in frames[0]}
     # Most settings drop the same: warn once.
     for dropped in sorted({describe_dropped(of_setting) for of_setting in scored.values()} - {""}):
         warnings.warn(dropped, DroppedWarning, stacklevel=3)
-    return {name: score_frames(of_setting) for name, of_setting in scored.items()}
+    return {name: score_frames(of_setting, config) for name, of_setting in scored.items()}
 
 
 @jax.jit

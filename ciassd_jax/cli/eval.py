@@ -12,7 +12,7 @@ import tyro
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
 from ciassd_jax.cli.options import Dtype, Frames, Unset
-from ciassd_jax.evaluation import Evaluation, evaluate, format_json, format_report, read_folders
+from ciassd_jax.evaluation import LIMITS, Evaluation, Limits, evaluate, format_json, format_report, read_folders
 from ciassd_jax.formats.writing import check_folder, write_text
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.scoring import Scored, detect_dataset, find_trained, score_frames, write_frames
@@ -26,21 +26,48 @@ class Text:
     """Folder of label files NNNNNN.txt, such as training/label_2."""
     results: Annotated[Path, tyro.conf.Positional]
     """Folder of result files with the same names; frames without a result file are not evaluated."""
+    overlap: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CLASS=OVERLAP", help_behavior_hint="")] = ()
+    """Also evaluate other classes, such as Vehicle=0.5 Forklift=0.4, or KITTI's at another overlap."""
     json: Unset[Path] = None
     """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
 
     def run(self) -> int:
+        limits = _add_overlaps(LIMITS, self.overlap)
         if self.json is not None:
             check_folder(self.json.parent)
         with warnings_as_lines(self.results):
             truths, detections = read_folders(self.labels, self.results)
-        evaluation = evaluate(truths, detections)
+        evaluation = evaluate(truths, detections, limits)
         if self.json is not None:
             write_text(self.json, format_json(evaluation))
         print(format_report(evaluation))
+        if evaluation.left_out:
+            name = next(iter(evaluation.left_out))
+            print(f"\n--overlap {name}=0.5 evaluates {name} at an overlap of 0.5.")
         if self.json is not None:
             print(f"Wrote {self.json}.")
         return 0
+
+
+def _add_overlaps(limits: Limits, given: Sequence[str]) -> Limits:
+    """Return the limits with those of texts CLASS=OVERLAP, which replace those of a class of the same name."""
+    added: dict[str, tuple[float, ...]] = {}
+    for text in given:
+        name, _, number = text.rpartition("=")
+        try:
+            overlap = float(number)
+        except ValueError:
+            overlap = 0.0
+        if not name or not 0 < overlap < 1:
+            raise UsageError(
+                f"--overlap {text} cannot be used; write CLASS=OVERLAP with an overlap between 0 and 1, such as "
+                "Vehicle=0.5."
+            )
+        if name.lower() in map(str.lower, added):
+            raise UsageError(f"--overlap names {name} twice, as case does not matter; give each class once.")
+        added[name] = (overlap,)
+    replaced = set(map(str.lower, added))
+    return {name: of_class for name, of_class in limits.items() if name.lower() not in replaced} | added
 
 
 @dataclass(frozen=True)
@@ -77,7 +104,7 @@ class Evaluate:
         if self.files is None:
             return self._network()
         if replace(self, files=None) != Evaluate():
-            raise UsageError("`ciassd eval txt` has one option, --json, after LABELS RESULTS; leave out the others.")
+            raise UsageError("`ciassd eval txt LABELS RESULTS` has --json and --overlap only; leave out the others.")
         return self.files.run()
 
     def _network(self) -> int:

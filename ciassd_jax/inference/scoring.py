@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Dataset, Frame
+from ciassd_jax.evaluation.kitti_ap import limits_of
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_frame
 from ciassd_jax.evaluation.summary import Evaluation, evaluate
 from ciassd_jax.formats.errors import DroppedWarning, FormatWarning, InputError, Pathlike
@@ -44,12 +46,15 @@ def score_dataset(
     detector: Detector, dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
 ) -> Evaluation:
     """Return the average precision of a detector on a data set: `score_frames` of `detect_dataset`."""
-    return score_frames(detect_dataset(detector, dataset, track))
+    return score_frames(detect_dataset(detector, dataset, track), detector.config)
 
 
-def score_frames(frames: Sequence[Scored]) -> Evaluation:
-    """Return the average precision by KITTI's rules. Without a camera, the points in a box define its difficulty."""
-    return evaluate([frame.truth for frame in frames], [frame.detections for frame in frames])
+def score_frames(frames: Sequence[Scored], config: Config) -> Evaluation:
+    """Return the average precision of the config's classes by KITTI's rules, at the overlaps of `limits_of`.
+
+    Without a camera, the points in a box define its difficulty.
+    """
+    return evaluate([frame.truth for frame in frames], [frame.detections for frame in frames], limits_of(config))
 
 
 def detect_dataset(

@@ -34,7 +34,7 @@ from ciassd_jax.training.checkpoint import Checkpoints
 from ciassd_jax.training.metrics import MetricsLog, describe_metrics, summarise
 from ciassd_jax.training.signals import deferred_signals
 from ciassd_jax.training.step import create_train_state, train_step
-from ciassd_jax.training.validation import Validation
+from ciassd_jax.training.validation import score_weights
 from ciassd_jax.types import Scene, TrainState, Variables
 
 _BEST, _LAST = TRAINED
@@ -112,8 +112,9 @@ def fit(
         metrics = distributed.on_process_0(partial(_start_metrics, folder, config, batches, step, log))
         if metrics is not None:
             stack.callback(metrics.close)
-        scored = Validation(validation, config) if validation is not None else None
-        run = _Run(config, folder, scored, intervals, checkpoints, batches, mesh, metrics, log, state, step, skipped)
+        run = _Run(
+            config, folder, validation, intervals, checkpoints, batches, mesh, metrics, log, state, step, skipped
+        )
         stopped = run.train(signals, progress and distributed.is_process_0())
     return Fitted(run.state, run.best, stopped)
 
@@ -124,7 +125,7 @@ class _Run:
 
     config: Config
     folder: Path
-    validation: Validation | None
+    validation: Dataset | None
     intervals: Intervals
     checkpoints: Checkpoints
     batches: Batches
@@ -246,15 +247,13 @@ class _Run:
         self.since = time.perf_counter()
         return score
 
-    def _score(self, step: int) -> float | None:
+    def _score(self, step: int) -> float:
         """Score the validation frames, and export the weights if they are the best so far."""
         assert self.validation is not None
         assert self.metrics is not None
-        numbers = self.validation.score(self.state, self.folder / "eval" / str(step))
-        if not numbers:
-            return None
-        score, best = next(iter(numbers.values())), self.best
-        self.metrics.write(step, {"score": score, **numbers})
+        numbers = score_weights(self.state, self.validation, self.config, self.folder / "eval" / str(step))
+        score, best = numbers["score"], self.best
+        self.metrics.write(step, numbers)
         self.log(f"step {step}  " + "  ".join(f"{name} {value:.2f}" for name, value in numbers.items()))
         if best is None or score > best:
             self._export(_BEST)

@@ -9,8 +9,9 @@ import numpy as np
 from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.scenes import target_labels
-from ciassd_jax.evaluation import Evaluation, format_json, format_report
-from ciassd_jax.evaluation.kitti_ap import LIMITS, Metric, Recall
+from ciassd_jax.evaluation import Evaluation, format_json, format_report, limits_of
+from ciassd_jax.evaluation.kitti_ap import Metric, Recall
+from ciassd_jax.formats.errors import Pathlike
 from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.writing import write_text
 from ciassd_jax.inference.detector import Detector
@@ -19,37 +20,35 @@ from ciassd_jax.ops.iou import iou_3d
 from ciassd_jax.types import Boxes, Variables
 
 
-class Validation:
-    """Scores successive weights on one data set, with programs that are compiled once."""
-
-    def __init__(self, dataset: Dataset, config: Config) -> None:
-        self._dataset, self._config = dataset, config
-
-    def score(self, state_or_variables: Variables, folder: Path) -> dict[str, float]:
-        """Return `precisions` of the weights; write result.json, table.txt and data/NAME.txt per frame to `folder`."""
-        frames = detect_dataset(Detector(state_or_variables, self._config), self._dataset)
-        evaluation = score_frames(frames)
-        write_frames(frames, folder / "data")
-        write_text(folder / "result.json", format_json(evaluation))
-        write_text(folder / "table.txt", format_report(evaluation))
-        return precisions(evaluation, self._config)
+def score_weights(
+    state_or_variables: Variables, dataset: Dataset, config: Config, folder: Pathlike
+) -> dict[str, float]:
+    """Return `precisions` of the weights; write result.json, table.txt and data/NAME.txt per frame to `folder`."""
+    frames = detect_dataset(Detector(state_or_variables, config), dataset)
+    evaluation = score_frames(frames, config)
+    folder = Path(folder)
+    write_frames(frames, folder / "data")
+    write_text(folder / "result.json", format_json(evaluation))
+    write_text(folder / "table.txt", format_report(evaluation))
+    return precisions(evaluation, config)
 
 
 def precisions(evaluation: Evaluation, config: Config) -> dict[str, float]:
-    """Return AP R40 moderate in percent, in 3D and BEV at both IoU limits, of the first class that KITTI evaluates.
+    """Return AP R40 moderate in percent, in 3D and BEV at the limits of every class, after "score".
 
-    The first number is 3D at the strict limit. It is 0 if nothing was detected, where KITTI's program prints nothing.
-    Empty without such a class.
+    The score is the mean over the classes in 3D at the strict limit. AP is 0 if nothing was detected, where KITTI's
+    program prints nothing.
     """
-    name = next((name for name in config.class_names if name in LIMITS), None)
-    if name is None:
-        return {}
+    limits = limits_of(config)
     metrics: tuple[Metric, ...] = ("3d", "bev")
-    return {
+    numbers = {
         f"{name}_{metric}_{limit:.2f}_moderate_R40": precision_of(evaluation, name, metric, limit)
+        for name, of_class in limits.items()
         for metric in metrics
-        for limit in LIMITS[name]
+        for limit in of_class
     }
+    strict = [precision_of(evaluation, name, "3d", of_class[0]) for name, of_class in limits.items()]
+    return {"score": sum(strict) / len(strict)} | numbers
 
 
 def precision_of(
@@ -61,15 +60,17 @@ def precision_of(
 
 
 def count_found(
-    variables: Variables, dataset: Dataset, config: Config, limit: float = 0.7, *, hardest: int | None = None
+    variables: Variables, dataset: Dataset, config: Config, *, hardest: int | None = None
 ) -> tuple[int, int]:
-    """Return (found, targets): how many targets in all frames are found, with their class and a 3D IoU >= `limit`.
+    """Return (found, targets): how many targets in all frames are found, with their class and enough 3D IoU.
 
-    Targets are the labelled objects of a configured class whose centre lies in the grid, with `hardest` only those of
-    KITTI's difficulties up to it (0 easy, 1 moderate, 2 hard).
+    The IoU must reach the strict limit of the class in evaluation. Targets are the labelled objects of a configured
+    class whose centre lies in the grid, with `hardest` only those of KITTI's difficulties up to it (0 easy, 1 moderate,
+    2 hard).
     """
     detector, found, targets = Detector(variables, config), 0, 0
     low, high = map(np.array, config.range)
+    limits = [of_class[0] for of_class in limits_of(config).values()]
     for index in range(len(dataset)):
         frame = dataset.read(index)
         result = detector(frame.points, frustum=frustum_of(frame.camera))
@@ -82,6 +83,6 @@ def count_found(
         for row in np.flatnonzero(wanted):
             overlap = iou_3d(Boxes(*(leaf[row][None] for leaf in frame.boxes)), boxes)
             same = np.array([name == config.class_names[label[row]] for name in result.labels], bool)
-            found += bool((same & (overlap >= limit)).any())
+            found += bool((same & (overlap >= limits[label[row]])).any())
             targets += 1
     return found, targets

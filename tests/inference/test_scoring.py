@@ -13,10 +13,11 @@ import pytest
 from mini_folders import NAMES, OBJECTS, object_boxes, write_custom, write_kitti
 from small import random_variables, small_config
 
-from ciassd_jax import Detector, load_weights
+from ciassd_jax import Config, Detector, load_weights
+from ciassd_jax.config import ClassConfig
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import Dataset
-from ciassd_jax.evaluation import Evaluation, evaluate, read_folders, to_json
+from ciassd_jax.evaluation import LIMITS, Evaluation, evaluate, read_folders, to_json
 from ciassd_jax.formats.errors import DroppedWarning, FormatWarning, InputError
 from ciassd_jax.formats.kitti_rows import parse_row
 from ciassd_jax.formats.points import read_points, write_bin
@@ -27,13 +28,14 @@ from ciassd_jax.simulation import Lidar, open_synthetic
 Detect = Callable[[np.ndarray], tuple[np.ndarray, tuple[str, ...]]]
 # Rounding to four decimals rarely moves an overlap past its limit or merges two scores.
 ROUNDING = 0.05
+CONFIG = Config(classes=tuple(ClassConfig(name=name) for name in LIMITS))
 
 
 class Oracle(Detector):
     """Returns given boxes with descending scores."""
 
     def __init__(self, detect: Detect) -> None:
-        self._find = detect
+        self.config, self._find = CONFIG, detect
 
     def __call__(self, points: Any, *, frustum: np.ndarray | None = None) -> FrameResult:
         boxes, labels = self._find(points)
@@ -92,7 +94,7 @@ def test_what_is_all_found_scores_what_is_possible(tmp_path: Path) -> None:
     dataset = open_dataset(write_kitti(tmp_path), "all")
     frames = detect_dataset(Oracle(all_objects), dataset)
     assert [frame.name for frame in frames] == list(NAMES)
-    evaluation = score_frames(frames)
+    evaluation = score_frames(frames, CONFIG)
     # Three objects fill the first three of 41 points of the curve, of which R40 counts two.
     for name, metric, limit in (("Car", "3d", 0.7), ("Car", "bev", 0.7), ("Pedestrian", "3d", 0.5)):
         assert evaluation.precision(name, metric, limit) == [5, 5, 5]
@@ -120,7 +122,7 @@ def test_files_evaluate_alike(tmp_path: Path) -> None:
     root = write_kitti(tmp_path, names=tuple(f"{i:06}" for i in range(24)))
     dataset = open_dataset(root, "all")
     frames = detect_dataset(blurred_truth(dataset), dataset)
-    evaluation = score_frames(frames)
+    evaluation = score_frames(frames, CONFIG)
     assert 20 < evaluation.precision("Car", "3d", 0.7)[1] < 60
     assert_same_precision(evaluation, written(frames, root / "training/label_2", tmp_path / "out"), ROUNDING)
     assert [path.name for path in sorted((tmp_path / "out").iterdir())] == [f"{i:06}.txt" for i in range(24)]
@@ -131,7 +133,7 @@ def test_a_frame_without_detections_is_an_empty_file(tmp_path: Path) -> None:
     frames = detect_dataset(Oracle(nothing), dataset)
     write_frames(frames, tmp_path / "out")
     assert [path.read_bytes() for path in (tmp_path / "out").iterdir()] == [b"", b"", b""]
-    assert score_frames(frames).precision("Car", "3d", 0.7) is None
+    assert score_frames(frames, CONFIG).precision("Car", "3d", 0.7) is None
 
 
 def test_boxes_outside_the_image_are_no_rows(tmp_path: Path) -> None:
@@ -149,7 +151,7 @@ def test_boxes_outside_the_image_are_no_rows(tmp_path: Path) -> None:
 def test_without_a_camera_boxes_stay_in_the_lidar_frame(tmp_path: Path) -> None:
     dataset = open_dataset(write_custom(tmp_path), "train")
     frames = detect_dataset(Oracle(all_objects), dataset)
-    evaluation = score_frames(frames)
+    evaluation = score_frames(frames, CONFIG)
     assert not evaluation.has_camera
     assert evaluation.precision("Car", "bbox", 0.7) is None
     # Two objects, both with fewer than 100 points: none is easy. Of their two points of the curve R40 counts one.
@@ -262,7 +264,7 @@ def test_the_best_of_a_training_is_taken(tmp_path: Path) -> None:
 def test_real_frames_evaluate_like_their_files(shared: Path, tmp_path: Path) -> None:
     dataset = open_dataset(shared / "kitti", "val")
     frames = detect_dataset(blurred_truth(dataset), dataset)
-    evaluation = score_frames(frames)
+    evaluation = score_frames(frames, CONFIG)
     assert 50 < evaluation.precision("Car", "3d", 0.7)[1] < 99
     assert_same_precision(evaluation, written(frames, shared / "kitti/training/label_2", tmp_path), ROUNDING)
 
@@ -279,5 +281,5 @@ def test_golden_weights_on_real_frames(shared: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(frames[0].result.boxes[:, :6], np.stack([x, y, z, length, width, height], 1), atol=5e-3)
     np.testing.assert_allclose(frames[0].detections.score, scores, atol=1e-3)
     again = written(frames, shared / "kitti/training/label_2", tmp_path)
-    assert_same_precision(score_frames(frames), again, ROUNDING)
+    assert_same_precision(score_frames(frames, CONFIG), again, ROUNDING)
     assert again.num_frames == 3
