@@ -1,26 +1,35 @@
 """Point clouds in `.bin` (KITTI), `.npy`, `.npz`, `.pcd` and `.ply` files.
 
-Readers return the values of the file; what they are worth (NaN, `check_intensity`) is judged by the caller.
+`read_points` returns the values of the file; values that are not finite are left to the caller, and intensities to
+`check_intensity`.
 """
 
 from __future__ import annotations
 
 import io
-import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike, read_bytes
+from ciassd_jax.formats.layout import guess_columns, looks_like_float64
+from ciassd_jax.formats.pcd import read_pcd
+from ciassd_jax.formats.ply import read_ply
 
 POINT_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply")
 
-_INTENSITY_FIELDS = ("intensity", "reflectance", "i")
-_PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
+_COLUMNS = ("x", "y", "z", "intensity")
+# The first of these that a file has is its intensity.
+_INTENSITIES = ("intensity", "reflectivity", "reflectance", "i")
+# Fewer points with more columns than this are points in columns.
+_MAX_COLUMNS = 12
+# Largest intensities of common sensors and files.
+_SCALES = (1, 255, 65535)
+
+NamedColumns = Sequence[tuple[str, np.ndarray]]
 
 
 # Arbitrary bytes read as floats need no warnings of NumPy's arithmetic.
@@ -28,65 +37,65 @@ _PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 def read_points(path: Pathlike, columns: int | Sequence[str] | None = None) -> Float32[np.ndarray, "N 4"]:
     """Read a point cloud as (x, y, z, intensity), coordinates in metres.
 
-    - `.bin`: little-endian float32, `columns` (4 if None) numbers per point.
-    - `.npy`, `.npz`: an array (N, 3 or more); in an archive the array `points`, or the only one.
-    - `.pcd`: ascii or binary, fields x, y, z and one of intensity, reflectance, i.
+    - `.bin`: little-endian float32.
+    - `.npy`, `.npz`: numbers (N, 3 or more), or a structured array; in an archive the array `points`, or the only one.
+    - `.pcd`: ascii, binary or binary_compressed.
+    - `.ply`: the vertices, ascii or binary.
 
-    Columns after the fourth are ignored. A missing intensity becomes 0, with a FormatWarning. Raises InputError, one
-    sentence with the remedy, for a file that is missing, empty or malformed.
+    `columns` describes the points of files that do not name their columns: how many numbers a point has, of which the
+    first are x, y, z, intensity, or the names of all. It defaults to 4 for `.bin` and to what an array has. Of named
+    columns, x, y, z and the first of intensity, reflectivity, reflectance, i are read, in any case and with or
+    without CloudCompare's prefix `scalar_`. Without an intensity it is 0, with a FormatWarning.
+
+    Raises InputError, one sentence with the remedy, for a file that is missing, empty or malformed, and for a `.bin`
+    whose numbers make sense only with another number of columns.
     """
-    width = columns if isinstance(columns, int) else 4 if columns is None else len(columns)
-    if width < 3:
-        raise InputError(f"{path}: {width} columns are too few; pass at least x,y,z as `columns`.")
     suffix = Path(path).suffix.lower()
+    width, names = (None, _COLUMNS) if columns is None else _column_names(columns)
     data = read_bytes(path)
     if suffix not in POINT_SUFFIXES:
         raise InputError(f"{path} has the unknown suffix '{suffix}'; convert it to one of {', '.join(POINT_SUFFIXES)}.")
     if not data:
         raise InputError(f"{path} is empty; copy or record it again.")
     if suffix == ".bin":
-        array = _read_bin(data, path, width)
-    elif suffix == ".pcd":
-        array = _read_pcd(data, path)
-    elif suffix == ".ply":
-        raise InputError(f"{path} is not read yet; save it as .npy.")
-    else:
-        array = _read_numpy(data, path, archive=suffix == ".npz")
-    return _as_points(array, path)
+        return _pick_columns(_read_bin(data, path, width or 4, names), path)
+    if suffix == ".pcd":
+        return _pick_columns(read_pcd(data, path), path)
+    if suffix == ".ply":
+        return _pick_columns(read_ply(data, path), path)
+    return _pick_columns(_name_columns(_read_numpy(data, path, archive=suffix == ".npz"), path, width, names), path)
 
 
 def parse_columns(text: str) -> int | tuple[str, ...]:
-    """Parse "5" or "x,y,z,intensity,ring" into what `read_points` takes as `columns`."""
-    text = text.strip()
-    return int(text) if text.isdecimal() else tuple(name.strip() for name in text.split(","))
-
-
-def check_intensity(
-    points: Float32[np.ndarray, "N 4"], scale: float, source: Pathlike
-) -> tuple[Float32[np.ndarray, "N 4"], int]:
-    """Return points with intensities clipped to [0, scale], and how many were clipped.
-
-    Raises InputError if more than 1 % lie outside. Intensities beyond 1000 times the scale are left for the
-    voxelisation to drop and count.
-    """
-    intensity = points[:, 3]
-    outside = (intensity < 0) | (intensity > scale)
-    if outside.sum() > len(points) / 100:
-        raise InputError(
-            f"{source} has {outside.mean():.0%} of its intensities outside [0, {scale:g}], up to {intensity.max():g}; "
-            f"pass {intensity.max():g} as `intensity_scale`."
-        )
-    clipped = outside & (np.abs(intensity) <= 1000 * scale)
-    if not clipped.any():
-        return points, 0
-    points = points.copy()
-    points[clipped, 3] = np.clip(points[clipped, 3], 0, scale)
-    return points, int(clipped.sum())
+    """Return what `read_points` takes as `columns` from a text such as "5" or "x,y,z,intensity,ring"."""
+    words = tuple(word.strip() for word in text.split(","))
+    return int(words[0]) if len(words) == 1 and words[0].isdecimal() else words
 
 
 def write_bin(path: Pathlike, points: Float[np.ndarray, "N 4"]) -> None:
     """Write (x, y, z, intensity) as little-endian float32, KITTI's `.bin`."""
     Path(path).write_bytes(points.astype("<f4").tobytes())
+
+
+def check_intensity(
+    points: Float32[np.ndarray, "N 4"], scale: float, source: Pathlike
+) -> tuple[Float32[np.ndarray, "N 4"], int]:
+    """Return the points with intensities clipped to [0, scale], and how many were clipped.
+
+    Intensities that are not finite or beyond 1000 times the scale are left: voxelisation drops and counts such points.
+    Raises InputError if more than 1 % of the points have a finite intensity outside [0, scale].
+    """
+    intensity = points[:, 3]
+    outside = ((intensity < 0) | (intensity > scale)) & np.isfinite(intensity)
+    if not outside.any():
+        return points, 0
+    if outside.mean() > 0.01:
+        fault = _intensity_fault(intensity[np.isfinite(intensity)], scale)
+        raise InputError(f"{source} has {100 * outside.mean():.3g} % of its intensities {fault}")
+    clipped = outside & (np.abs(intensity) <= 1000 * scale)
+    points = points.copy()
+    points[clipped, 3] = np.clip(points[clipped, 3], 0, scale)
+    return points, int(clipped.sum())
 
 
 def scale_intensity(points: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, "N 4"], float | None]:
@@ -101,28 +110,83 @@ def scale_intensity(points: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndar
     return np.concatenate([points[:, :3], points[:, 3:] / np.float32(255)], 1), top
 
 
-def _as_points(array: np.ndarray, path: Pathlike) -> Float32[np.ndarray, "N 4"]:
-    """Return the first four columns, or three and intensity 0."""
-    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+def _intensity_fault(intensity: Float32[np.ndarray, " N"], scale: float) -> str:
+    """Say how finite intensities lie outside [0, scale], and the remedy."""
+    fault = f"outside [0, {scale:g}], from {intensity.min():g} to {intensity.max():g}"
+    if (intensity < 0).mean() > 0.005:
+        return f"{fault}; save them without negative numbers, or name their column as `columns`."
+    fit = next((one for one in _SCALES if (intensity > one).mean() <= 0.001), intensity.max())
+    values, counts = np.unique(intensity, return_counts=True)
+    if len(values) <= 128 and values[-1] < 256 and (values % 1 == 0).all() and counts.max() < 3 * counts.mean():
+        rings = "if they are ring numbers, pass names such as x,y,z,ring,intensity as `columns`"
+        return f"{fault}; {rings}, else {fit:g} as `intensity_scale`."
+    return f"{fault}; pass {fit:g} as `intensity_scale`."
+
+
+def _column_names(columns: int | Sequence[str]) -> tuple[int, tuple[str, ...]]:
+    """Return the number of columns and the names of all or the first four; raises InputError without x, y and z."""
+    width, names = (columns, _COLUMNS[: max(columns, 0)]) if isinstance(columns, int) else (len(columns), columns)
+    lower = [name.lower() for name in names]
+    if any(lower.count(name) != 1 for name in "xyz"):
+        text = columns if isinstance(columns, int) else ",".join(columns)
         raise InputError(
-            f"{path} holds an array of shape {array.shape} and type {array.dtype}; "
-            "save numbers of shape (N, 4): x, y, z, intensity."
+            f"{text} does not give x, y and z one column each; "
+            "pass a number from 3, or names such as x,y,z,intensity,ring, as `columns`."
         )
-    points = np.zeros((len(array), 4), np.float32)
-    columns = min(array.shape[1], 4)
-    if columns == 3:
-        warnings.warn(f"{path} has no intensity; 0 is used instead.", FormatWarning, stacklevel=4)
-    points[:, :columns] = array[:, :columns]
+    return width, tuple(names)
+
+
+def _pick_columns(columns: NamedColumns, path: Pathlike) -> Float32[np.ndarray, "N 4"]:
+    """Return x, y, z and the intensity, or 0 and a FormatWarning."""
+    named: dict[str, np.ndarray] = {}
+    for name, values in columns:
+        named.setdefault(name.lower().removeprefix("scalar_"), values)
+    found = ", ".join(name for name, _ in columns)
+    if missing := [name for name in "xyz" if name not in named]:
+        raise InputError(f"{path} has the columns {found} but not {', '.join(missing)}; save it again with x, y, z.")
+    picked = [*"xyz", *[name for name in _INTENSITIES if name in named][:1]]
+    points = np.zeros((len(named["x"]), 4), np.float32)
+    for index, name in enumerate(picked):
+        points[:, index] = named[name]
+    if len(picked) == 3:
+        text = f"{path} has no intensity among its columns {found}; 0 is used instead."
+        warnings.warn(text, FormatWarning, stacklevel=4)
     return points
 
 
-def _read_bin(data: bytes, path: Pathlike, width: int) -> Float32[np.ndarray, "N width"]:
+def _read_bin(data: bytes, path: Pathlike, width: int, names: tuple[str, ...]) -> NamedColumns:
+    if looks_like_float64(data):
+        raise InputError(f"{path} holds float64 numbers, and a .bin is read as float32; save it as .npy.")
+    numbers = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
+    guess = guess_columns(numbers, width)
+    if guess != width and len(data) % (4 * guess) == 0:
+        raise InputError(
+            f"{path} makes no sense with {width} columns but does with {guess}; "
+            f"pass {guess} as `columns`, or save it as .npy."
+        )
     if len(data) % (4 * width):
         raise InputError(
             f"{path} has {len(data)} bytes, not a multiple of {4 * width} ({width} float32 per point); "
             "copy it again, or pass the correct number as `columns`."
         )
-    return np.frombuffer(data, "<f4").reshape(-1, width)
+    return list(zip(names, numbers.reshape(-1, width).T, strict=False))
+
+
+def _name_columns(array: np.ndarray, path: Pathlike, width: int | None, names: tuple[str, ...]) -> NamedColumns:
+    """Return the columns of an array of numbers, or the fields of a structured one."""
+    if array.dtype.names:
+        return [(name, array[name].ravel()) for name in array.dtype.names if array.dtype[name].kind in "fiu"]
+    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path} holds an array of shape {array.shape} and type {array.dtype}; "
+            "save numbers of shape (N, 4): x, y, z, intensity."
+        )
+    rows, found = array.shape
+    if rows < found > _MAX_COLUMNS and width != found:
+        raise InputError(f"{path} holds an array of shape {array.shape}; transpose it to {(found, rows)}.")
+    if width not in (None, found):
+        raise InputError(f"{path} has {found} columns, not {width}; pass {found}, or as many names, as `columns`.")
+    return list(zip(names, array.T, strict=False))
 
 
 def _read_numpy(data: bytes, path: Pathlike, *, archive: bool) -> np.ndarray:
@@ -143,110 +207,3 @@ def _read_numpy(data: bytes, path: Pathlike, *, archive: bool) -> np.ndarray:
         f"{path} holds {len(names)} arrays ({', '.join(names)}) and none is named 'points'; "
         "write it again with np.savez(path, points=points)."
     )
-
-
-class _PcdField(NamedTuple):
-    """The position of a field in a row, by byte and by column, and its type."""
-
-    offset: int
-    column: int
-    dtype: np.dtype
-
-
-class _PcdHeader(NamedTuple):
-    """Fields by name, bytes and columns per row, number of rows, and how the rows are stored."""
-
-    fields: dict[str, _PcdField]
-    stride: int
-    columns: int
-    num_points: int
-    storage: str
-
-
-def _read_pcd(data: bytes, path: Pathlike) -> Float[np.ndarray, "N columns"]:
-    header, body = _read_pcd_header(data, path)
-    missing = [name for name in "xyz" if name not in header.fields]
-    if missing:
-        raise InputError(
-            f"{path} has the fields {', '.join(header.fields)} but not {', '.join(missing)}; "
-            "save it again with x, y, z and intensity."
-        )
-    intensity = [name for name in _INTENSITY_FIELDS if name in header.fields][:1]
-    fields = [header.fields[name] for name in ("x", "y", "z", *intensity)]
-    if header.storage == "ascii":
-        return _read_pcd_ascii(body, path, header, fields)
-    if header.storage == "binary":
-        return _read_pcd_binary(body, path, header, fields)
-    raise InputError(
-        f"{path} stores its points as '{header.storage}', which is not read; "
-        f"convert it with `pcl_convert_pcd_ascii_binary {path} out.pcd 1`."
-    )
-
-
-def _read_pcd_ascii(
-    body: bytes, path: Pathlike, header: _PcdHeader, fields: list[_PcdField]
-) -> Float[np.ndarray, "N columns"]:
-    try:
-        values = np.array(body.split(), np.float64)
-    except ValueError as error:
-        raise InputError(f"{path} has a point that is not a number; save it again.") from error
-    if values.size != header.num_points * header.columns:
-        raise InputError(
-            f"{path} announces {header.num_points} points of {header.columns} numbers "
-            f"but holds {values.size} numbers; copy or save it again."
-        )
-    return values.reshape(-1, header.columns)[:, [field.column for field in fields]]
-
-
-def _read_pcd_binary(
-    body: bytes, path: Pathlike, header: _PcdHeader, fields: list[_PcdField]
-) -> Float[np.ndarray, "N columns"]:
-    # A few bytes after the last point are allowed, because some writers end the file with a newline.
-    if len(body) // header.stride != header.num_points:
-        raise InputError(
-            f"{path} announces {header.num_points} points of {header.stride} bytes "
-            f"but holds {len(body)} bytes; copy or save it again."
-        )
-    names = [str(field.column) for field in fields]
-    formats, offsets = [field.dtype for field in fields], [field.offset for field in fields]
-    row = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": header.stride})
-    rows = np.frombuffer(body, row, count=header.num_points)
-    return np.stack([rows[name].astype(np.float64) for name in names], -1)
-
-
-def _read_pcd_header(data: bytes, path: Pathlike) -> tuple[_PcdHeader, bytes]:
-    """Split a PCD file into its header and the bytes after it."""
-    entries: dict[str, list[str]] = {}
-    stream = io.BytesIO(data)
-    for line in stream:
-        key, *values = line.decode("latin-1").split() or ["#"]
-        entries[key] = values
-        if key == "DATA":
-            break
-    try:
-        return _parse_pcd_header(entries), stream.read()
-    except (LookupError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path} has a malformed PCD header ({str(error)[:80]}); "
-            "save it again with FIELDS, SIZE, TYPE, WIDTH, HEIGHT, POINTS and DATA."
-        ) from error
-
-
-def _parse_pcd_header(entries: dict[str, list[str]]) -> _PcdHeader:
-    """Parse the entries; raises LookupError, TypeError or ValueError for a missing or invalid one."""
-    names = entries["FIELDS"]
-    counts = [int(count) for count in entries.get("COUNT", ["1"] * len(names))]
-    fields: dict[str, _PcdField] = {}
-    stride = columns = 0
-    for name, size, kind, count in zip(names, entries["SIZE"], entries["TYPE"], counts, strict=True):
-        if int(size) < 1 or count < 1:
-            raise ValueError(f"field {name} has size {size} and count {count}")
-        fields.setdefault(name, _PcdField(stride, columns, np.dtype(f"<{_PCD_KINDS[kind]}{size}")))
-        stride += int(size) * count
-        columns += count
-    sizes = ["POINTS"] if "POINTS" in entries else ["WIDTH", "HEIGHT"]
-    rows = math.prod(int(entries[key][0]) for key in sizes)
-    if rows < 0 or not 0 < stride < 2**31:
-        raise ValueError(f"{rows} points of {stride} bytes")
-    (storage,) = entries["DATA"]
-    return _PcdHeader(fields, stride, columns, rows, storage)

@@ -89,7 +89,7 @@ def test_bin_round_trip_and_other_widths(tmp_path):
     np.testing.assert_array_equal(read_points(str(tmp_path / "a.bin")), POINTS)
     (tmp_path / "five.bin").write_bytes(np.pad(POINTS, ((0, 0), (0, 1))).tobytes())
     np.testing.assert_array_equal(read_points(tmp_path / "five.bin", columns=5), POINTS)
-    with pytest.raises(InputError, match="2 columns are too few"):
+    with pytest.raises(InputError, match="2 does not give x, y and z"):
         read_points(tmp_path / "a.bin", columns=2)
 
 
@@ -102,7 +102,7 @@ def test_bin_round_trip_and_other_widths(tmp_path):
 )
 def test_points_without_intensity_get_zero_and_a_warning(tmp_path, name, data):
     (tmp_path / name).write_bytes(data)
-    with pytest.warns(UserWarning, match="has no intensity; 0 is used"):
+    with pytest.warns(UserWarning, match="has no intensity among its columns x, y, z; 0 is used"):
         points = read_points(tmp_path / name)
     np.testing.assert_array_equal(points, POINTS * np.float32([1, 1, 1, 0]))
 
@@ -162,8 +162,8 @@ BAD = {
     "blank.pcd": (pcd(b"", POINTS=""), "malformed PCD header"),
     "nothing.pcd": (pcd(b"", fields="", size="", kind=""), "3 points of 0 bytes"),
     "rgb.pcd": (
-        pcd(b"", fields="x y rgb w"),
-        "has the fields x, y, rgb, w but not z; save it again with x, y, z",
+        pcd(b"", fields="x y rgb w", POINTS=0),
+        "has the columns x, y, rgb, w but not z; save it again with x, y, z",
     ),
     "rows.pcd": (
         pcd(ascii_rows(POINTS[:2])),
@@ -176,9 +176,8 @@ BAD = {
         "announces 3 points of 16 bytes but holds 47 bytes; copy or save it again",
     ),
     "packed.pcd": (
-        pcd(b"", storage="binary_compressed"),
-        r"stores its points as 'binary_compressed', which is not read; convert it with "
-        r"`pcl_convert_pcd_ascii_binary \S+packed.pcd out.pcd 1`",
+        pcd(b"", storage="zip"),
+        "stores its points as 'zip'; save it as ascii, binary or binary_compressed",
     ),
 }
 
