@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from ciassd_jax.data.custom import PLACES as CUSTOM_PLACES
@@ -13,15 +14,26 @@ from ciassd_jax.data.splits import Places
 from ciassd_jax.formats.errors import InputError, Pathlike
 
 
-def open_dataset(root: Pathlike | None, split: str, image_size: tuple[int, int] | None = None) -> Dataset:
+def open_dataset(
+    root: Pathlike | None,
+    split: str,
+    image_size: tuple[int, int] | None = None,
+    columns: int | Sequence[str] | None = None,
+    *,
+    need_labels: bool = True,
+) -> Dataset:
     """Open the frames of a split in a KITTI folder, or in one of OpenPCDet's custom layout.
 
-    `root` defaults to the environment variable KITTI_ROOT. `split` is train, val, trainval, test, "all", or the name
-    of a file in ROOT/ImageSets. `image_size` (width, height) overrides that of KITTI's images. Raises InputError, one
-    sentence with the remedy, for a folder or a split that does not exist.
+    `root` defaults to the environment variable KITTI_ROOT. `split` is train, val, trainval, test, "all", the name of a
+    file in ROOT/ImageSets, or the path of such a file. `image_size` (width, height) overrides that of KITTI's images,
+    `columns` are those of the clouds (`read_points`). Every frame has labels, except those of KITTI's test or with
+    `need_labels` false. Raises InputError, one sentence with the remedy, for a folder or a split that does not exist,
+    and for frames without their files.
     """
     folder = find_root(root)
-    return open_custom(folder, split) if is_custom(folder) else open_kitti(folder, split, image_size)
+    if is_custom(folder):
+        return open_custom(folder, split, columns, need_labels=need_labels)
+    return open_kitti(folder, split, image_size, columns, need_labels=need_labels)
 
 
 def find_root(root: Pathlike | None) -> Path:

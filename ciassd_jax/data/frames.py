@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,9 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from ciassd_jax.formats.custom_rows import CustomRow
-from ciassd_jax.formats.errors import FormatWarning, Pathlike
+from ciassd_jax.formats.errors import Pathlike, warn_of_file
 from ciassd_jax.formats.kitti_camera import Camera
-from ciassd_jax.formats.kitti_rows import DONT_CARE, ObjectRow
-from ciassd_jax.formats.points import scale_intensity
+from ciassd_jax.formats.kitti_rows import ObjectRow, is_dont_care
 from ciassd_jax.types import Boxes
 
 # Number of points inside an object from which it is easy, moderate, hard, for data without a camera.
@@ -42,7 +40,7 @@ class Frame(NamedTuple):
     @property
     def objects(self) -> list[ObjectRow | CustomRow]:
         """The rows of the objects, in the order of `boxes`: all but DontCare."""
-        return [row for row in self.rows or () if isinstance(row, CustomRow) or row.type != DONT_CARE]
+        return [row for row in self.rows or () if isinstance(row, CustomRow) or not is_dont_care(row.type)]
 
 
 @dataclass(frozen=True)
@@ -75,17 +73,10 @@ def difficulty_by_points(inside: Int[np.ndarray, " G"]) -> Int[np.ndarray, " G"]
 
 
 def clean_points(points: Float32[np.ndarray, "N 4"], path: Pathlike) -> Float32[np.ndarray, "P 4"]:
-    """Return the finite points of a file with intensity in [0, 1].
-
-    Intensities are divided by 255 if they exceed 2. A FormatWarning tells what was dropped or scaled.
-    """
+    """Return the finite points of a file; a FormatWarning tells how many are not."""
     finite = np.isfinite(points).all(1)
-    if not finite.all():
-        text = f"{path}: {(~finite).sum()} of {len(points)} points are not finite; they were left out."
-        warnings.warn(text, FormatWarning, stacklevel=3)
-        points = points[finite]
-    points, top = scale_intensity(points)
-    if top is not None:
-        text = f"{path} has intensities of up to {top:g}; they were divided by 255, as they should lie in [0, 1]."
-        warnings.warn(text, FormatWarning, stacklevel=3)
-    return points
+    if finite.all():
+        return points
+    text = f"{path}: {(~finite).sum()} of {len(points)} points are not finite; they were left out."
+    warn_of_file(text, path, stacklevel=4)
+    return points[finite]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,8 @@ from jaxtyping import Float32, Int
 
 from ciassd_jax.config import ClassConfig, Config
 from ciassd_jax.data.frames import Dataset
-from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes
+from ciassd_jax.data.splits import split_title
+from ciassd_jax.formats.errors import InputError, Pathlike, grouped_warnings, read_bytes
 from ciassd_jax.formats.writing import replacing
 from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.types import Boxes, SampledObjects
@@ -61,7 +63,7 @@ class ObjectDatabase:
 
 def database_path(folder: Path, split: str) -> Path:
     """Return the usual file of a split's database in a folder."""
-    return folder / f"objects_{split}.bin"
+    return folder / f"objects_{split_title(split)}.bin"
 
 
 def find_database(
@@ -98,8 +100,8 @@ def build_database(dataset: Dataset, path: Pathlike, track: Callable[[range], It
     """Write the database of all objects of the data set, of any class, difficulty and number of points.
 
     An object has the points strictly inside its box. The file is written frame by frame and appears whole or not at
-    all. `track` wraps the iteration over the frames, for a progress bar. Raises InputError for a frame that cannot be
-    read and a file that cannot be written.
+    all. `track` wraps the iteration over the frames, for a progress bar. Gives one FormatWarning for each kind of
+    problem with the frames. Raises InputError for a frame that cannot be read and a file that cannot be written.
     """
     _write_database(dataset, Path(path), fingerprint_of(dataset), track)
 
@@ -125,7 +127,7 @@ def _write_database(dataset: Dataset, path: Path, fingerprint: str, track: Calla
     total = 0
     names: dict[str, int] = {}
     records: list[tuple] = []
-    with replacing(path) as temporary, open(temporary, "wb") as stream:
+    with grouped_warnings(), replacing(path) as temporary, open(temporary, "wb") as stream:
         stream.write(_MAGIC)
         for index in track(range(len(dataset))):
             frame = dataset.read(index)
@@ -203,17 +205,18 @@ def sample_objects(
 ) -> SampledObjects:
     """Draw objects for a scene with objects of these types, as NumPy arrays (section 4.1).
 
-    A class lacks `gt_sampling_up_to` minus the objects of exactly its name, and up to twice that number is drawn, for
-    two rounds without repetition. The draw depends on (seed, epoch, frame) alone, all non-negative, so that workers
-    and resumed runs agree. The released code walks through a shuffled list of the database instead, which uses objects
-    more evenly, but what a scene gets then depends on the order of the workers' requests.
+    A class lacks `gt_sampling_up_to` minus the objects of its name in any case, without similar types, and up to twice
+    that number is drawn, for two rounds without repetition. The draw depends on (seed, epoch, frame) alone, all
+    non-negative, so that workers and resumed runs agree. The released code walks through a shuffled list of the
+    database instead, which uses objects more evenly, but what a scene gets then depends on the order of the workers'
+    requests.
     """
     objects, switches = no_objects(config), config.data.augmentation
     if not switches.gt_sampling:
         return objects
-    drawn = np.full(len(objects.label), -1)
+    drawn, present = np.full(len(objects.label), -1), Counter(map(str.lower, names_in_scene))
     for label, one in enumerate(config.classes):
-        wanted = max(one.gt_sampling_up_to - names_in_scene.count(one.name), 0)
+        wanted = max(one.gt_sampling_up_to - present[one.name.lower()], 0)
         eligible = eligible_objects(database, one, difficulty_filter=switches.difficulty_filter)
         chance = np.random.default_rng((seed, epoch, frame, label))
         chosen = chance.choice(eligible, min(2 * wanted, len(eligible)), replace=False)
@@ -221,15 +224,16 @@ def sample_objects(
         drawn[slots[: len(chosen)]] = chosen
         objects.wanted[label] = wanted
     _fill(objects, database, drawn)
+    # The loader refuses or counts such intensities of the same points in their own frames.
+    objects.points[:, 3].clip(0, config.input.intensity_scale, out=objects.points[:, 3])
     return objects
 
 
 def eligible_objects(database: ObjectDatabase, one: ClassConfig, *, difficulty_filter: bool) -> Int[np.ndarray, " E"]:
-    """Return the objects of exactly the class's name with enough points and, if filtered, with a difficulty."""
-    if one.name not in database.names:
-        return np.zeros(0, np.int64)
+    """Return the objects of the class's name with enough points and, if filtered, with a difficulty."""
     objects = database.objects
-    fit = (objects["name"] == database.names.index(one.name)) & (objects["count"] >= one.gt_sampling_min_points)
+    named = [index for index, name in enumerate(database.names) if name.lower() == one.name.lower()]
+    fit = np.isin(objects["name"], named) & (objects["count"] >= one.gt_sampling_min_points)
     return np.flatnonzero(fit & (objects["difficulty"] >= 0) if difficulty_filter else fit)
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Iterable
+
 import numpy as np
 from jaxtyping import Int
 
 from ciassd_jax.config import Config
-from ciassd_jax.data.frames import Frame
-from ciassd_jax.formats.errors import InputError
+from ciassd_jax.data.frames import Dataset, Frame
+from ciassd_jax.formats.errors import InputError, collected_warnings, warn_of_file
 from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
 
 OBSTACLE = -1
@@ -16,12 +19,14 @@ OBSTACLE = -1
 def pad_frame(frame: Frame, index: int, config: Config) -> Scene:
     """Pad a frame to the capacities of `config.data`, as NumPy arrays; `index` is its place in the data set.
 
-    An object is a target of the class with its name or, with `similar_classes`, of the class that lists it as similar.
-    Other objects are obstacles (label -1), and with `filter_scenes` so are those without a difficulty. Points over
-    capacity are cut evenly from the whole cloud, boxes from the end; both are counted. Raises InputError for a box
-    whose values are not finite or whose size is not positive.
+    An object is a target of the class with its name or, with `similar_classes`, of the class that lists it as similar;
+    case does not matter, but a FormatWarning tells of a difference. Other objects are obstacles (label -1), and with
+    `filter_scenes` so are those without a difficulty. Points over capacity are cut evenly from the whole cloud, boxes
+    from the end; both are counted. Raises InputError for a box whose values are not finite or whose size is not
+    positive.
     """
     _check_boxes(frame)
+    _tell_of_case(frame, config)
     data = config.data
     points, kept = _spread(len(frame.points), data.max_points), min(len(frame.names), data.max_boxes)
     padded = np.zeros((data.max_points, 4), np.float32)
@@ -43,12 +48,46 @@ def pad_frame(frame: Frame, index: int, config: Config) -> Scene:
 def target_labels(frame: Frame, config: Config) -> Int[np.ndarray, " G"]:
     """Return the class that each object of the frame is a target of, -1 for an obstacle."""
     augmentation = config.data.augmentation
-    labels = {name: label for label, one in enumerate(config.classes) for name in one.similar}
-    if not augmentation.similar_classes:
-        labels.clear()
-    labels |= {name: label for label, name in enumerate(config.class_names)}
-    label = np.array([labels.get(name, OBSTACLE) for name in frame.names], np.int32)
+    labels = config.labels_by_name(similar=augmentation.similar_classes)
+    label = np.array([labels.get(name.lower(), OBSTACLE) for name in frame.names], np.int32)
     return np.where(frame.difficulty < 0, np.int32(OBSTACLE), label) if augmentation.filter_scenes else label
+
+
+def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Iterable[int]] = iter) -> None:
+    """Raise InputError, which tells what the labels have, unless a target lies in the range of the grid.
+
+    Reads up to the first frame with a target. `track` wraps the iteration over the frames, for a progress bar.
+    """
+    low, high = (np.array(limit) for limit in config.range)
+    found: Counter[str] = Counter()
+    outside: Counter[str] = Counter()
+    for index in track(range(len(dataset))):
+        # The loader reads the frames again and gives their warnings.
+        with collected_warnings():
+            frame = dataset.read(index)
+        inside = ((frame.boxes.center >= low) & (frame.boxes.center <= high)).all(-1)
+        if (inside & (target_labels(frame, config) >= 0)).any():
+            return
+        found.update(frame.names)
+        outside.update(name for name, within in zip(frame.names, inside, strict=True) if not within)
+    types = ", ".join(f"{name} ({count}, {outside[name]} out of range)" for name, count in found.most_common())
+    graded = " and with a difficulty" if config.data.augmentation.filter_scenes else ""
+    space = ", ".join(f"{axis} {least:g}..{most:g}" for axis, least, most in zip("xyz", low, high, strict=True))
+    raise InputError(
+        f"None of {found.total()} labelled objects in {len(dataset)} frames is of a class that is learned "
+        f"({', '.join(config.class_names)}), within {space} m{graded}; the labels have {types or 'no objects'}, so "
+        "choose classes and range with `ciassd data suggest`, or list a type as `similar` of a class."
+    )
+
+
+def _tell_of_case(frame: Frame, config: Config) -> None:
+    similar = config.data.augmentation.similar_classes
+    labels = config.labels_by_name(similar=similar)
+    spelled = {name for one in config.classes for name in (one.name, *(one.similar if similar else ()))}
+    for name in sorted(set(frame.names) - spelled):
+        if name.lower() in labels:
+            target = config.class_names[labels[name.lower()]]
+            warn_of_file(f"Labels of type {name} count as {target}, because case does not matter.")
 
 
 def _spread(count: int, capacity: int) -> Int[np.ndarray, " kept"]:

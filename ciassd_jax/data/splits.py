@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from ciassd_jax.formats.errors import InputError, read_bytes
+from ciassd_jax.formats.errors import InputError
+from ciassd_jax.formats.kitti_camera import IMAGE_SUFFIXES
+from ciassd_jax.formats.lines import read_text
+from ciassd_jax.formats.points import POINT_SUFFIXES
 
 # Kind of file to the paths where a frame may have it, {} for the frame; the first that exists is used.
 Places = Mapping[str, Sequence[str]]
 # The split of all frames that have files.
 ALL = "all"
+# Bytes of the longest name of a frame; file systems allow 255 with the suffix.
+_LONGEST = 200
 
 NUM_TRAINING, NUM_TESTING = 7481, 7518
 # The frames of Chen et al.'s train list as bits in base64, most significant first; val are the others.
@@ -46,6 +51,11 @@ def official_split(split: str) -> tuple[str, ...] | None:
     return tuple(f"{frame:06d}" for frame in frames[split].tolist()) if split in frames else None
 
 
+def with_suffixes(place: str, suffixes: Iterable[str]) -> tuple[str, ...]:
+    """Return the paths of a place with each of the suffixes, in small and in capital letters."""
+    return tuple(f"{place}{form}" for suffix in suffixes for form in (suffix, suffix.upper()))
+
+
 def split_names(root: Path, split: str, folder: Path, places: Places) -> tuple[str, ...]:
     """Return the names of a split's frames (`listed_names`), each once and with its files in `folder`.
 
@@ -57,30 +67,39 @@ def split_names(root: Path, split: str, folder: Path, places: Places) -> tuple[s
     twice = repeated_names(names)
     if twice:
         raise InputError(f"{source}: {twice[0]}; list it once.")
-    missing = missing_files(folder, places, names)
-    if missing:
-        raise InputError(f"{source}: {missing[0]}; copy them, or list the others in {split_file(root, split)}.")
+    for kind, clause in _missing(folder, places, names).items():
+        complete = sum(all(find_file(folder, paths, name) for paths in places.values()) for name in names)
+        empty = " (empty files for frames without objects)" if kind == "label" else ""
+        place = "a file and give its path as the split" if split == ALL else split_file(root, split)
+        others = f", or list only the {complete} complete frames in {place}" if complete else ""
+        raise InputError(f"{source}: {clause}; copy them{empty}{others}.")
     return names
 
 
 def listed_names(root: Path, split: str, folder: Path, places: Places) -> tuple[tuple[str, ...], str]:
-    """Return the names of a split as listed, and their source: `ImageSets/SPLIT.txt`, else KITTI's official list.
+    """Return the names of a split as listed, and their source: `split_file`, else KITTI's official list.
 
-    The split "all" has every frame with a file in `folder`. Raises InputError for a split without a list.
+    The split "all" has every frame with a file in `folder`. Raises InputError for a split without a list, and for a
+    list of other things than names.
     """
     path, official = split_file(root, split), official_split(split)
     if split == ALL:
         return present_names(folder, places), str(folder)
     if path.is_file():
-        return tuple(read_bytes(path).decode("utf-8-sig", errors="replace").split()), str(path)
+        return _read_names(path), str(path)
     if official is None or "calibration" not in places:
         raise InputError(f"{path} does not exist; write it, one frame per line, or choose the split '{ALL}'.")
     return official, f"The official list of {split}"
 
 
 def split_file(root: Path, split: str) -> Path:
-    """Return the file that lists a split."""
-    return root / "ImageSets" / f"{split}.txt"
+    """Return the file that lists a split: `split` itself if it is a path, else ROOT/ImageSets/SPLIT.txt."""
+    return Path(split) if _is_path(split) else root / "ImageSets" / f"{split}.txt"
+
+
+def split_title(split: str) -> str:
+    """Return the name of a split, for files that belong to it."""
+    return Path(split).stem if _is_path(split) else split
 
 
 def repeated_names(names: Sequence[str]) -> list[str]:
@@ -90,8 +109,23 @@ def repeated_names(names: Sequence[str]) -> list[str]:
 
 def present_names(folder: Path, places: Places) -> tuple[str, ...]:
     """Return the names of the frames that have any of their files, sorted."""
-    paths = (path for patterns in places.values() for pattern in patterns for path in folder.glob(pattern.format("*")))
-    return tuple(sorted({path.stem for path in paths}))
+    return tuple(sorted({path.stem for paths in places.values() for path in present_paths(folder, paths)}))
+
+
+def present_paths(folder: Path, places: Sequence[str]) -> list[Path]:
+    """Return the files of all frames in these places, sorted; names that start with a dot are no data."""
+    paths = {path for place in places for path in folder.glob(place.format("*"))}
+    return sorted(path for path in paths if not path.name.startswith("."))
+
+
+def same_stem(paths: Sequence[Path]) -> tuple[Path, Path] | None:
+    """Return the first two paths that differ only in their suffix, or None."""
+    by_stem: dict[Path, Path] = {}
+    for path in paths:
+        other = by_stem.setdefault(path.with_suffix(""), path)
+        if other is not path:
+            return other, path
+    return None
 
 
 def find_file(folder: Path, places: Sequence[str], name: str) -> Path | None:
@@ -107,11 +141,40 @@ def present_files(name: str, *, folder: Path, places: Places) -> tuple[Path, ...
 
 def missing_files(folder: Path, places: Places, names: Sequence[str]) -> list[str]:
     """Return a clause for each kind of file that frames lack."""
-    sentences = []
+    return list(_missing(folder, places, names).values())
+
+
+def _missing(folder: Path, places: Places, names: Sequence[str]) -> dict[str, str]:
+    """Return a clause by kind of file that frames lack."""
+    clauses = {}
     for kind, paths in places.items():
         lacking = [name for name in names if find_file(folder, paths, name) is None]
         if lacking:
             shown = ", ".join(lacking[:3]) + (", ..." if len(lacking) > 3 else "")
-            wanted = " or ".join(str(folder / path.format("NAME")) for path in paths)
-            sentences.append(f"{len(lacking)} of {len(names)} frames have no {kind} {wanted} ({shown})")
-    return sentences
+            wanted = f"{len(lacking)} of {len(names)} frames have no {kind} {describe_places(folder, paths)}"
+            clauses[kind] = f"{wanted} ({shown})"
+    return clauses
+
+
+def describe_places(folder: Path, places: Sequence[str]) -> str:
+    """Return the paths of a frame NAME in these places, for messages."""
+    suffixes: dict[str, dict[str, None]] = {}
+    for place in places:
+        stem, _, suffix = place.partition("{}")
+        suffixes.setdefault(stem, {})[suffix.lower()] = None
+    return " or ".join(f"{folder / stem / 'NAME'}{' or '.join(each)}" for stem, each in suffixes.items())
+
+
+def _is_path(split: str) -> bool:
+    return len(Path(split).parts) > 1 or split.lower().endswith(".txt")
+
+
+def _read_names(path: Path) -> tuple[str, ...]:
+    """Read a list of names, one per line, with or without the suffixes of their files."""
+    names = [line.strip() for line in read_text(path).splitlines() if line.strip()]
+    for name in names:
+        if name.startswith(".") or len(name.encode()) > _LONGEST or set(name) & set("/\\\0"):
+            what = "write the names of the frames' files without folders, one per line; none starts with a dot"
+            raise InputError(f"{path}: {name[:40]!r} does not name a frame; {what}.")
+    suffixes = (*POINT_SUFFIXES, ".txt", *IMAGE_SUFFIXES)
+    return tuple(Path(name).stem if Path(name).suffix.lower() in suffixes else name for name in names)

@@ -17,6 +17,8 @@ from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes
 from ciassd_jax.formats.lines import read_text
 from ciassd_jax.ops.camera import frustum_planes
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
 # Width and height of the image by focal length, which differ between KITTI's recording days.
 _IMAGE_SIZES = {
     721.5377: (1242, 375),
@@ -24,6 +26,9 @@ _IMAGE_SIZES = {
     718.3351: (1238, 374),
     718.856: (1241, 376),
 }
+# The first bytes of a JPEG file, the markers of its frame header (SOF0 to SOF15, without DHT, JPG and DAC), and the
+# number of bytes to read in which an image usually has its header.
+_JPEG, _FRAME_MARKERS, _HEADER = b"\xff\xd8", {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}, 2**16
 # Names of each matrix in the object and the tracking benchmark, and its shape.
 _MATRICES = (
     (("P2",), (3, 4)),
@@ -50,12 +55,12 @@ class Camera(NamedTuple):
 def read_camera(path: Pathlike, image: Path | None = None, image_size: tuple[int, int] | None = None) -> Camera:
     """Read the camera from the calibration file `path`.
 
-    The size of the image is `image_size`, else that of the PNG file `image` if it exists, else KITTI's for the focal
-    length. Raises InputError, one sentence with the remedy, if the size is unknown or a file is malformed.
+    The size of the image is `image_size`, else that of the PNG or JPEG file `image` if it exists, else KITTI's for the
+    focal length. Raises InputError, one sentence with the remedy, if the size is unknown or a file is malformed.
     """
     calibration = read_calibration(path)
     if image_size is None and image is not None and image.is_file():
-        image_size = read_png_size(image)
+        image_size = read_image_size(image)
     size = image_size or image_size_for(calibration)
     if size is None:
         raise InputError(
@@ -93,13 +98,38 @@ def read_calibration(path: Pathlike) -> Calibration:
     return Calibration(*matrices)
 
 
-def read_png_size(path: Pathlike) -> tuple[int, int]:
-    """Return width and height in pixels from the header of a PNG file; raises InputError for another file."""
-    data = read_bytes(path, 24)
+def read_image_size(path: Pathlike) -> tuple[int, int]:
+    """Return width and height in pixels from the header of a PNG or JPEG file; raises InputError for another file."""
+    data = read_bytes(path, _HEADER)
+    size = _png_size(data) or _jpeg_size(data)
+    # A camera may write previews and profiles before the header of the image itself.
+    if size is None and data.startswith(_JPEG):
+        size = _jpeg_size(read_bytes(path))
+    if size is None:
+        raise InputError(
+            f"{path} is not a PNG or JPEG image; copy it again, or give its size as `image_size` (width, height)."
+        )
+    return size
+
+
+def _png_size(data: bytes) -> tuple[int, int] | None:
+    """Return width and height from the first chunk of a PNG file, or None."""
     if len(data) < 24 or data[:8] != b"\x89PNG\r\n\x1a\n" or data[12:16] != b"IHDR":
-        raise InputError(f"{path} is not a PNG image; give the frame's image_2 file or the image size.")
-    width, height = struct.unpack(">II", data[16:24])
+        return None
+    width, height = struct.unpack_from(">II", data, 16)
     return width, height
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Return width and height from the frame header of a JPEG file, or None."""
+    place = len(_JPEG) if data.startswith(_JPEG) else len(data)
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        if data[place + 1] in _FRAME_MARKERS:
+            height, width = struct.unpack_from(">HH", data, place + 5)
+            return width, height
+        # A marker may be preceded by any number of bytes 0xFF; the length of a segment counts its own two bytes.
+        place += 1 if data[place + 1] == 0xFF else 2 + struct.unpack_from(">H", data, place + 2)[0]
+    return None
 
 
 def image_size_for(calibration: Calibration) -> tuple[int, int] | None:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 from ciassd_jax.formats.errors import InputError, Pathlike
 from ciassd_jax.formats.lines import parse_lines, read_lines
 
-OBJECT_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 # The type of areas without labels.
 DONT_CARE = "DontCare"
 _RESULT_COLUMNS = 16
@@ -86,12 +85,17 @@ def read_rows(path: Pathlike) -> list[ObjectRow]:
 
 
 def read_labels(path: Pathlike, problems: list[InputError] | None = None) -> list[ObjectRow]:
-    """Read a label file, whose types must be KITTI's; DontCare areas are rows too.
+    """Read a label file, of objects of any type; DontCare areas are rows too.
 
     Raises InputError as `read_rows`. With a list of `problems`, the errors of all malformed lines are appended to it
     instead, and the other rows are returned.
     """
-    return parse_lines(path, _parse_label, problems)
+    return parse_lines(path, parse_row, problems)
+
+
+def is_dont_care(row_type: str) -> bool:
+    """Return whether rows of a type are areas without labels; case does not matter."""
+    return row_type.lower() == DONT_CARE.lower()
 
 
 def parse_row(line: str, place: str) -> ObjectRow:
@@ -139,14 +143,6 @@ def format_row(row: ObjectRow) -> str:
 def write_rows(path: Pathlike, rows: Iterable[ObjectRow]) -> None:
     """Write one line per row; without rows the file is empty."""
     Path(path).write_text("".join(format_row(row) + "\n" for row in rows), encoding="utf-8", newline="\n")
-
-
-def _parse_label(line: str, place: str) -> ObjectRow:
-    row = parse_row(line, place)
-    if row.type not in (*OBJECT_TYPES, DONT_CARE):
-        known = ", ".join(OBJECT_TYPES)
-        raise InputError(f"{place}: the type '{row.type}' is none of KITTI's; write {known} or {DONT_CARE}.")
-    return row
 
 
 def _parse_columns(columns: list[str], place: str) -> ObjectRow:

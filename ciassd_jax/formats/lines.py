@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -11,9 +12,11 @@ Row = TypeVar("Row")
 
 
 def read_text(path: Pathlike) -> str:
-    """Return the text of a file; raises InputError as `read_bytes`."""
+    """Return the text of a file in UTF-8, or in UTF-16 with its mark; raises InputError as `read_bytes`."""
+    data = read_bytes(path)
+    encoding = "utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     # Bytes that are not text become values that are not numbers, which the parsers refuse by name.
-    return read_bytes(path).decode("utf-8-sig", errors="replace")
+    return data.decode(encoding, errors="replace")
 
 
 def read_lines(path: Pathlike) -> list[tuple[str, str]]:

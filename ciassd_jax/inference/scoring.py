@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -15,7 +14,14 @@ from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.evaluation.kitti_ap import limits_of
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_frame
 from ciassd_jax.evaluation.summary import Evaluation, evaluate
-from ciassd_jax.formats.errors import DroppedWarning, FormatWarning, InputError, Pathlike
+from ciassd_jax.formats.errors import (
+    DroppedWarning,
+    FormatWarning,
+    InputError,
+    Pathlike,
+    collected_warnings,
+    give_grouped,
+)
 from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.kitti_rows import format_row
 from ciassd_jax.formats.writing import replacing
@@ -82,22 +88,14 @@ def labelled_frames(
     dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
 ) -> Iterator[tuple[Frame, LabelledObjects]]:
     """Yield each frame of a data set and its labels; warnings and errors are those of `detect_dataset`."""
-    lacking: dict[str, list[str]] = {}
+    found: list[FormatWarning] = []
     for index, _ in enumerate(track(dataset.names)):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", FormatWarning)
+        with collected_warnings() as caught:
             frame = dataset.read(index)
         truth = labels_from_frame(frame)
-        for one in caught:
-            if issubclass(one.category, FormatWarning):
-                text = str(one.message)
-                lacking.setdefault(_kind(text, dataset.sources(index)), []).append(text)
-            else:
-                warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+        found += caught
         yield frame, truth
-    for first, *others in lacking.values():
-        more = f" Other frames with this problem: {len(others)}." if others else ""
-        warnings.warn(first + more, FormatWarning, stacklevel=3)
+    give_grouped(found, stacklevel=4)
 
 
 def describe_dropped(frames: Sequence[Scored]) -> str:
@@ -135,13 +133,6 @@ def find_trained(workdir: Pathlike) -> Path:
         if (Path(workdir) / name).is_file():
             return Path(workdir) / name
     raise InputError(f"{workdir} has neither {' nor '.join(TRAINED)}; give the folder of a training with weights.")
-
-
-def _kind(text: str, sources: Iterable[Path]) -> str:
-    """Return the text of a warning without files and numbers, so that it is equal for all frames."""
-    for path in sources:
-        text = text.replace(str(path), "")
-    return re.sub(r"\d[\d.e+]*", "", text)
 
 
 def _dropped(frames: Sequence[Scored]) -> list[str]:

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import json
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
-from ciassd_jax.data.clouds import CloudFile, find_beside, find_clouds
+from ciassd_jax.data.clouds import CloudFile, find_beside, find_clouds, find_image
 from ciassd_jax.data.folders import is_custom, is_kitti, open_dataset
 from ciassd_jax.data.frames import Dataset, clean_points
-from ciassd_jax.data.kitti import IMAGE, kitti_folder, kitti_frame
+from ciassd_jax.data.kitti import IMAGES, crop_to_view, is_reduced, kitti_folder, kitti_frame
+from ciassd_jax.data.splits import find_file
 from ciassd_jax.formats.custom_rows import parse_custom_row, read_custom_rows
-from ciassd_jax.formats.errors import FormatWarning, InputError, read_bytes
+from ciassd_jax.formats.errors import InputError, read_bytes, warn_of_file
 from ciassd_jax.formats.kitti_boxes import rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera
-from ciassd_jax.formats.kitti_rows import DONT_CARE, read_labels, read_rows
+from ciassd_jax.formats.kitti_rows import is_dont_care, read_labels, read_rows
 from ciassd_jax.formats.lines import read_lines
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.view.view_frame import ViewFrame, frame_to_view
@@ -37,26 +37,28 @@ class Source(NamedTuple):
     image: Path | None
 
 
-def find_sources(path: Path, split: str = "all", image_size: tuple[int, int] | None = None) -> dict[str, Source]:
+def find_sources(
+    path: Path,
+    split: str = "all",
+    image_size: tuple[int, int] | None = None,
+    columns: int | Sequence[str] | None = None,
+) -> dict[str, Source]:
     """Return the frames at `path` by name.
 
-    `path` is a file of points, a folder of such files, or a data set, of which `split` selects the frames. A data set
-    in KITTI's layout has clouds cropped to the camera's view; the other layout is OpenPCDet's custom one. Clouds of a
-    folder are shown whole, with the labels and images beside them. `image_size` (width, height) overrides that of
-    KITTI's images. Raises InputError, one sentence with the remedy, for any other path.
+    `path` is a file of points, a folder of such files, or a data set, of which `split` selects the frames, with or
+    without labels. A data set in KITTI's layout has clouds cropped to the camera's view; the other layout is
+    OpenPCDet's custom one. Clouds of a folder are shown whole, with the labels and images beside them. `image_size`
+    (width, height) overrides that of KITTI's images, `columns` are those of the clouds. Raises InputError, one sentence
+    with the remedy, for any other path.
     """
-    if is_custom(path):
-        return dataset_sources(open_dataset(path, split))
-    if is_kitti(path):
-        return dataset_sources(open_dataset(path, split, image_size), kitti_folder(path, split)[0])
+    if is_custom(path) or is_kitti(path):
+        folder = None if is_custom(path) else kitti_folder(path, split)[0]
+        return dataset_sources(open_dataset(path, split, image_size, columns, need_labels=False), folder)
     inside = next((path / name for name in _LABELS if (path / name).is_dir()), None)
     if inside:
         raise InputError(f"{path} is part of a data set; name {path.parent} for the whole, or {inside} for its clouds.")
-    clouds = find_clouds(path, image_size=image_size)
-    return {
-        file.cloud.stem: Source(partial(_read_cloud, file), find_beside(file.cloud, "image_2", ".png"))
-        for file in clouds
-    }
+    clouds = find_clouds(path, image_size=image_size, columns=columns)
+    return {file.cloud.stem: Source(partial(_read_cloud, file, columns), find_image(file.cloud)) for file in clouds}
 
 
 def dataset_sources(dataset: Dataset, folder: Path | None = None) -> dict[str, Source]:
@@ -65,7 +67,15 @@ def dataset_sources(dataset: Dataset, folder: Path | None = None) -> dict[str, S
     def read(name: str) -> ViewFrame:
         return frame_to_view(dataset.read_frame(name))
 
-    return {name: Source(partial(read, name), _existing(folder, IMAGE.format(name))) for name in dataset.names}
+    def image(name: str) -> Path | None:
+        return None if folder is None else find_file(folder, IMAGES, name)
+
+    return {name: Source(partial(read, name), image(name)) for name in dataset.names}
+
+
+def detector_points(frame: ViewFrame) -> Float[np.ndarray, "P columns"]:
+    """Return the points of a frame for a detector: of a whole cloud only those that the camera sees."""
+    return crop_to_view(frame.points, frame.camera) if frame.whole and frame.camera else frame.points
 
 
 def read_source(source: Source, *, image: bool = False) -> ViewFrame:
@@ -113,20 +123,22 @@ def add_saved(frame: ViewFrame, folder: Path) -> ViewFrame | None:
 _Saved = tuple[np.ndarray, np.ndarray, tuple[str, ...]]
 
 
-def _read_cloud(file: CloudFile) -> ViewFrame:
+def _read_cloud(file: CloudFile, columns: int | Sequence[str] | None) -> ViewFrame:
     """A whole cloud, with the objects of the label file beside it."""
-    name, points = file.cloud.stem, clean_points(read_points(file.cloud), file.cloud)
+    name, points = file.cloud.stem, clean_points(read_points(file.cloud, columns), file.cloud)
+    frame = ViewFrame(name, points, camera=file.camera, whole=not is_reduced(file.cloud))
     folder = _LABELS.get(file.cloud.absolute().parent.name)
     path = find_beside(file.cloud, folder, ".txt") if folder else None
     if path is not None and folder == "labels":
         rows = read_custom_rows(path)
         boxes = np.array([row.box for row in rows], np.float64).reshape(-1, 7)
-        return ViewFrame(name, points, truth=boxes, truth_labels=tuple(row.type for row in rows))
+        return frame._replace(truth=boxes, truth_labels=tuple(row.type for row in rows))
     if path is not None and file.camera is not None:
-        return frame_to_view(kitti_frame(name, points, tuple(read_labels(path)), file.camera))
+        labelled = frame_to_view(kitti_frame(name, points, tuple(read_labels(path)), file.camera))
+        return labelled._replace(whole=frame.whole)
     if path is not None:
-        warnings.warn(f"{path} is not shown, because {file.cloud} has no calibration.", FormatWarning, stacklevel=3)
-    return ViewFrame(name, points, camera=file.camera)
+        warn_of_file(f"{file.cloud} has no calibration, so its labels are not shown.", file.cloud)
+    return frame
 
 
 def _read_json(path: Path) -> _Saved:
@@ -143,7 +155,7 @@ def _read_json(path: Path) -> _Saved:
 
 
 def _read_kitti(path: Path, camera: Camera) -> _Saved:
-    rows = [row for row in read_rows(path) if row.type != DONT_CARE]
+    rows = [row for row in read_rows(path) if not is_dont_care(row.type)]
     if any(row.score is None for row in rows):
         raise InputError(f"{path} has rows without a score, which are not detections; name the folder of results.")
     scores = np.array([row.score for row in rows], np.float64)

@@ -21,6 +21,7 @@ class ViewFrame(NamedTuple):
 
     The first columns of `points` are x, y, z (metres); boxes are x, y, z, length, width, height, yaw. `scores` are None
     for boxes without scores, and labels may be empty. `image` is shown only with a `camera` that projects the boxes.
+    `whole` clouds have points that the camera does not see, and that a detector should not get.
     """
 
     name: str
@@ -32,6 +33,7 @@ class ViewFrame(NamedTuple):
     truth_labels: Sequence[str] = ()
     camera: Camera | None = None
     image: UInt8[np.ndarray, "rows columns 3"] | None = None
+    whole: bool = False
 
 
 def frame_to_view(frame: Frame, image: UInt8[np.ndarray, "rows columns 3"] | None = None) -> ViewFrame:

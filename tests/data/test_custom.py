@@ -31,14 +31,6 @@ def test_a_frame_without_objects(tmp_path: Path) -> None:
     assert (frame.names, frame.boxes.center.shape, frame.difficulty.shape) == ((), (0, 3), (0,))
 
 
-def test_intensities_of_0_to_255_are_divided(tmp_path: Path) -> None:
-    root = write_custom(tmp_path)
-    np.save(root / "points/a.npy", full_cloud(0) * [1, 1, 1, 255])
-    with pytest.warns(FormatWarning, match=r"a\.npy has intensities of up to 25\d.*; they were divided by 255"):
-        frame = open_dataset(root, "train").read(0)
-    np.testing.assert_allclose(frame.points, full_cloud(0), atol=1e-5)
-
-
 def test_points_that_are_not_finite_are_left_out_with_a_warning(tmp_path: Path) -> None:
     root = write_custom(tmp_path)
     points = full_cloud(0)

@@ -108,7 +108,7 @@ def test_a_missing_image_is_warned_of_once_where_clouds_are_cropped(tmp_path: Pa
     for name in NAMES[:2]:
         (root / f"training/image_2/{name}.png").unlink()
         (root / f"training/calib/{name}.txt").write_text(KITTI_CALIBRATION)
-    message = r"image_2/NAME\.png is missing for 2 of 3 frames whose clouds are cropped to the image; the usual size"
+    message = r"image_2/NAME\.png or \.jpg or \.jpeg is missing for 2 of 3 frames whose clouds are cropped to the image; the usual size"
     with pytest.warns(FormatWarning, match=message):
         dataset = open_dataset(root, "all")
     camera = dataset.read(0).camera
@@ -128,15 +128,6 @@ def test_an_unknown_camera_without_its_image_is_refused(tmp_path: Path) -> None:
     (root / "training/image_2/000000.png").unlink()
     with pytest.raises(InputError, match=r"calib/000000\.txt has a focal length of 300 pixels, .* `image_size`"):
         read_first(root)
-
-
-def test_intensities_of_0_to_255_are_divided(tmp_path: Path) -> None:
-    root = write_kitti(tmp_path, clouds="velodyne_reduced")
-    points = object_points(0) * np.array([1, 1, 1, 255], np.float32)
-    write_bin(root / "training/velodyne_reduced/000000.bin", points)
-    with pytest.warns(FormatWarning, match=r"000000\.bin has intensities of up to 25\d.*; they were divided by 255"):
-        frame = read_first(root)
-    np.testing.assert_allclose(frame.points, object_points(0), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +151,11 @@ def test_intensities_of_0_to_255_are_divided(tmp_path: Path) -> None:
             lambda data: data.replace(b"Car 0.0000", b"Car nan"),
             r"line 1: a value is not finite; write",
         ),
-        ("image_2/000000.png", lambda data: data[:9], r"image_2/000000\.png is not a PNG image; give"),
+        (
+            "image_2/000000.png",
+            lambda data: data[:9],
+            r"image_2/000000\.png is not a PNG or JPEG image; copy it again, or give its size as `image_size`",
+        ),
     ],
 )
 def test_a_file_that_cannot_be_used_gets_one_sentence(tmp_path: Path, file: str, damage, message: str) -> None:

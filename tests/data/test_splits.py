@@ -61,7 +61,7 @@ def test_a_split_file_wins_over_the_official_list(tmp_path: Path) -> None:
             "mine",
             ("000001", "000002", "000003"),
             r"mine\.txt: 2 of 3 frames have no cloud \S+velodyne_reduced/NAME\.bin or \S+velodyne/NAME\.bin "
-            r"\(000002, 000003\); copy them, or list the others in \S+mine\.txt\.",
+            r"\(000002, 000003\); copy them, or list only the 1 complete frames in \S+mine\.txt\.",
         ),
         (
             "val",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from kitti_samples import CALIBRATION, assert_refused
 
-from ciassd_jax.formats.kitti_camera import image_size_for, read_calibration, read_png_size
+from ciassd_jax.formats.kitti_camera import image_size_for, read_calibration, read_image_size
 
 
 def write_calibration(path, names=("P2:", "R0_rect:", "Tr_velo_to_cam:"), calibration=CALIBRATION):
@@ -58,7 +58,7 @@ def test_an_unusable_calibration_gets_one_sentence(tmp_path, damage, message):
     assert_refused(read_calibration, path, message)
 
 
-@pytest.mark.parametrize("read", [read_calibration, read_png_size])
+@pytest.mark.parametrize("read", [read_calibration, read_image_size])
 def test_no_file_and_a_directory(tmp_path, read):
     assert_refused(read, tmp_path / "no.txt", "does not exist; check the path")
     assert_refused(read, tmp_path, "is a directory; name a file inside it")
@@ -84,10 +84,25 @@ def test_png_size(tmp_path):
     header = b"IHDR" + (1242).to_bytes(4, "big") + (375).to_bytes(4, "big") + bytes([8, 2, 0, 0, 0])
     png = b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4, "big") + header + zlib.crc32(header).to_bytes(4, "big")
     (tmp_path / "a.png").write_bytes(png)
-    assert read_png_size(tmp_path / "a.png") == (1242, 375)
+    assert read_image_size(tmp_path / "a.png") == (1242, 375)
     for data in (b"", png[:20], b"\xff\xd8" + png[2:]):
         (tmp_path / "a.png").write_bytes(data)
-        assert_refused(read_png_size, tmp_path / "a.png", "is not a PNG image; give")
+        assert_refused(read_image_size, tmp_path / "a.png", "is not a PNG or JPEG image; copy it again")
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"progressive": True}, {"exif": b"Exif" + bytes(60000), "icc_profile": bytes(150000)}]
+)
+def test_the_size_of_a_jpeg_is_pillow_s(tmp_path, options):
+    """Also behind previews and profiles that are larger than what is read first, whatever the name of the file."""
+    image = pytest.importorskip("PIL.Image").fromarray(np.zeros((37, 123, 3), np.uint8))
+    image.save(tmp_path / "a.jpg", **options)
+    assert read_image_size(tmp_path / "a.jpg") == (123, 37)
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.jpg").read_bytes())
+    assert read_image_size(tmp_path / "a.png") == (123, 37)
+    for end in (2, 3, 20, 100):
+        (tmp_path / "a.jpg").write_bytes((tmp_path / "a.png").read_bytes()[:end])
+        assert_refused(read_image_size, tmp_path / "a.jpg", "is not a PNG or JPEG image; copy it again")
 
 
 @pytest.mark.reference
@@ -95,4 +110,4 @@ def test_png_sizes_agree_with_focal_lengths(shared):
     root = shared / "kitti_full/training"
     for path in sorted((root / "image_2").glob("*.png")):
         calibration = read_calibration(root / "calib" / f"{path.stem}.txt")
-        assert read_png_size(path) == image_size_for(calibration)
+        assert read_image_size(path) == image_size_for(calibration)

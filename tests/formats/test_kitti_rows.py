@@ -12,6 +12,7 @@ from ciassd_jax.formats.kitti_rows import (
     ObjectRow,
     difficulty_of,
     format_row,
+    is_dont_care,
     read_labels,
     read_results,
     read_rows,
@@ -55,18 +56,22 @@ def test_an_unusable_row_gets_one_sentence(tmp_path, line, message):
     assert_refused(read_rows, tmp_path / "a.txt", message)
 
 
-def test_every_problem_of_a_label_file_is_collected(tmp_path):
+def test_every_problem_of_a_label_file_is_collected_and_any_type_is_read(tmp_path):
     path = tmp_path / "a.txt"
     label = format_row(ROW._replace(score=None))
-    path.write_text(f"{label}\nCar 0\n{label.replace('Car', 'Bus')}\n{label.replace('Car', 'DontCare')}\n")
+    path.write_text(f"{label}\nCar 0\n{label.replace('Car', 'forklift')}\n{label.replace('Car 0.0000', 'Car nan')}\n")
     problems: list[InputError] = []
     rows = read_labels(path, problems)
-    assert [(row.type, row.place) for row in rows] == [("Car", f"{path}, line 1"), ("DontCare", f"{path}, line 4")]
+    assert [(row.type, row.place) for row in rows] == [("Car", f"{path}, line 1"), ("forklift", f"{path}, line 3")]
     first, second = map(str, problems)
     assert first.startswith(f"{path}, line 2: 2 columns")
-    assert second.startswith(f"{path}, line 3: the type 'Bus' is none of KITTI's; write Car, ")
+    assert second.startswith(f"{path}, line 4: a value is not finite")
     with pytest.raises(InputError, match="line 2: 2 columns"):
         read_labels(path)
+
+
+def test_areas_without_labels_are_known_in_any_case():
+    assert [is_dont_care(name) for name in ("DontCare", "dontcare", "DONTCARE", "Car")] == [True, True, True, False]
 
 
 def test_no_file_and_a_directory(tmp_path):
