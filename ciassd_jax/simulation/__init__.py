@@ -1,4 +1,4 @@
-"""Synthetic street scenes as a 64-beam LiDAR sees them, with KITTI's labels.
+"""Synthetic street scenes as a LiDAR sees them, with KITTI's labels.
 
 `open_synthetic` returns a data set that is simulated as it is read, and `write_synthetic` writes a folder in KITTI's
 layout. Both call `simulate`, the pure function from a random key to a cloud and its objects.

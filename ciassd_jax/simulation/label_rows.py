@@ -27,17 +27,21 @@ def label_rows(
     through: Int[np.ndarray, " O"],
     arriving: Int[np.ndarray, " O"],
     camera: Camera,
+    names: tuple[str, ...] = KINDS,
+    max_range: float = np.inf,
 ) -> list[ObjectRow]:
     """Return the label rows of the objects in the image, nearest first; those that are hardly visible are DontCare.
+
+    So are objects with a centre farther than `max_range` metres. `names` are those of the kinds.
 
     Of the rays `through` a box, the `arriving` ones are not stopped before it. Occlusion is 0, 1 or 2 if at most 20, 55
     or 85 % of them are stopped; an object that is hidden more has no row. Truncation is the fraction of the projected
     box outside the image.
     """
-    names = [KINDS[index] for index in kind]
-    rows, kept = boxes_to_rows(boxes, np.zeros(len(names)), names, *camera)
+    rows, kept = boxes_to_rows(boxes, np.zeros(len(kind)), [names[index] for index in kind], *camera)
     inside = _part_inside(boxes, rows, kept, camera)
     hidden = 1 - arriving[kept] / np.maximum(through[kept], 1)
+    unseen = (arriving < _MIN_RAYS) | (np.linalg.norm(boxes.center, axis=-1) > max_range)
     labelled = []
     order = np.argsort([row.location[2] for row in rows], kind="stable")
     for index in order.tolist():
@@ -45,7 +49,7 @@ def label_rows(
         x1, y1, x2, y2 = row.bbox
         if hidden[index] > _HIDDEN[-1] or inside[index] < _MIN_INSIDE or x2 - x1 < 2 or y2 - y1 < 2:
             continue
-        if arriving[kept[index]] < _MIN_RAYS or y2 - y1 < _MIN_HEIGHT:
+        if unseen[kept[index]] or y2 - y1 < _MIN_HEIGHT:
             labelled.append(_DONT_CARE_ROW._replace(bbox=row.bbox))
             continue
         occluded = int(np.searchsorted(_HIDDEN, hidden[index]))

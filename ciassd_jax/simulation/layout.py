@@ -5,6 +5,7 @@ Positions are drawn along the road (u) and across it (v). An object that would c
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -18,11 +19,13 @@ from ciassd_jax.simulation.materials import material
 from ciassd_jax.simulation.road_users import (
     CAR,
     CYCLIST,
+    MACHINE,
     NUM_STYLES,
     PEDESTRIAN,
     TRUCK,
     VAN,
     draw_size,
+    machine,
     person,
     vehicle,
 )
@@ -33,6 +36,8 @@ from ciassd_jax.types import Array, Boxes
 # Slots of one lane and of all lanes, then of parked cars, yards, the crossing street and people, half on each side.
 _LANE, _TRAFFIC, _PARKED, _YARDS, _CROSSING, _PEOPLE = 8, 48, 52, 16, 6, 16
 _OBJECTS = _TRAFFIC + _PARKED + _YARDS + _CROSSING + _PEOPLE
+# Slots of machines, if there are any; they come before all others.
+NUM_MACHINES = 12
 _SIDES = (1, -1)
 _LANE_WIDTH = 3.3
 _START, _END = -60.0, 78.0
@@ -73,38 +78,25 @@ class Street(NamedTuple):
     yards: Float[Array, ""]
 
 
-@jax.jit
-def sample_world(key: jax.Array) -> World:
-    """Draw a random scene."""
-    chances = deal(key, 1, 1, _TRAFFIC, _PARKED, _YARDS, _CROSSING, _PEOPLE, _OBJECTS, NUM_CLUTTER, NUM_CLUTTER_KINDS)
-    (
-        for_street,
-        for_ground,
-        for_traffic,
-        for_parked,
-        for_yards,
-        for_crossing,
-        for_people,
-        chance,
-        clutter_chance,
-        of_kinds,
-    ) = chances
-    street = _draw_street(for_street)
-    ground = _draw_ground(for_ground, street)
-    vehicles = join(
-        _draw_traffic(for_traffic, street, ground),
-        _draw_parked(for_parked, street, ground),
-        _draw_yards(for_yards, street, ground),
-        _draw_crossing(for_crossing, ground),
+@partial(jax.jit, static_argnames=("height", "machines"))
+def sample_world(key: jax.Array, height: float, machines: int = 0) -> World:
+    """Draw a random scene for a sensor that is mounted at `height` (metres), with slots for a number of `machines`."""
+    groups = (machines, _TRAFFIC, _PARKED, _YARDS, _CROSSING, _PEOPLE)
+    for_street, for_ground, *for_slots, chance, clutter_chance, of_kinds = deal(
+        key, 1, 1, *groups, machines + _OBJECTS, NUM_CLUTTER, NUM_CLUTTER_KINDS
     )
-    slots = join(vehicles, _draw_people(for_people, street, ground))
+    street = _draw_street(for_street)
+    ground = _draw_ground(for_ground, street, height)
+    draws = (_draw_machines, _draw_traffic, _draw_parked, _draw_yards, _draw_crossing, _draw_people)
+    slots = join(*(draw(some, street, ground) for draw, some in zip(draws, for_slots, strict=True)))
     size = jax.vmap(draw_size)(jnp.stack([chance.normal() for _ in range(3)], -1), slots.kind)
     style = jnp.stack([chance.uniform() for _ in range(NUM_STYLES)], -1)
     objects, clutter = _settle(slots, size, draw_clutter(clutter_chance, of_kinds, ground), ground)
-    number = len(vehicles.u)
+    people = len(slots.u) - _PEOPLE
     solids = [
-        _build(vehicle, objects, style, slice(0, number)),
-        _build(person, objects, style, slice(number, None)),
+        _build(machine, objects, style, slice(0, machines)),
+        _build(vehicle, objects, style, slice(machines, people)),
+        _build(person, objects, style, slice(people, None)),
         clutter_solids(clutter, ground),
         _ego(),
     ]
@@ -126,13 +118,13 @@ def _draw_street(chance: Chance) -> Street:
     )
 
 
-def _draw_ground(chance: Chance, street: Street) -> Ground:
+def _draw_ground(chance: Chance, street: Street, height: float) -> Ground:
     half = street.lanes * _LANE_WIDTH
     # The sensor drives on the right, in any of the lanes, so the middle of the road is to its left.
     lane = jnp.floor(chance.uniform() * street.lanes)
     middle = half - _LANE_WIDTH * (lane + chance.uniform(0.4, 0.6))
     return Ground(
-        sensor_height=1.73 + 0.03 * chance.normal(),
+        sensor_height=height + 0.03 * chance.normal(),
         slope=jnp.stack([0.006 + 0.006 * chance.normal(), 0.008 * chance.normal()]),
         bend=1.0e-4 * chance.normal(),
         yaw=jnp.where(chance.flip(0.2), 0.3, 0.05) * chance.normal(),
@@ -145,6 +137,20 @@ def _draw_ground(chance: Chance, street: Street) -> Ground:
         beyond=jnp.where(chance.flip(0.6), material("grass"), jnp.int32(material("paving"))),
         shade=chance.uniform(0.75, 1.3),
         roughness=chance.uniform(0.01, 0.045),
+    )
+
+
+def _draw_machines(chance: Chance, street: Street, ground: Ground) -> Slots:
+    """Machines in parking spaces, on pavements and in yards, in any direction."""
+    side, place = jnp.where(chance.flip(0.5), 1, -1), chance.uniform()
+    yard = ground.pavement + chance.uniform(1.5, 12.0)
+    away = jnp.where(place < 0.3, -_of(side, street.strip) / 2, jnp.where(place < 0.6, ground.pavement / 2, yard))
+    return Slots(
+        u=chance.uniform(-5.0, 50.0),
+        v=ground.middle + side * (ground.half_width + away),
+        yaw=chance.uniform(-np.pi, np.pi),
+        kind=jnp.full_like(side, MACHINE),
+        present=chance.flip(0.5),
     )
 
 
@@ -192,7 +198,7 @@ def _draw_yards(chance: Chance, street: Street, ground: Ground) -> Slots:
     )
 
 
-def _draw_crossing(chance: Chance, ground: Ground) -> Slots:
+def _draw_crossing(chance: Chance, _: Street, ground: Ground) -> Slots:
     """Vehicles on the crossing street."""
     side = np.repeat(_SIDES, _CROSSING // 2)
     return Slots(
@@ -223,7 +229,7 @@ def _draw_people(chance: Chance, street: Street, ground: Ground) -> Slots:
     )
 
 
-def _of(side: np.ndarray, values: Array) -> Array:
+def _of(side: np.ndarray | Array, values: Array) -> Array:
     """The left or the right value for each slot."""
     return jnp.where(side > 0, values[0], values[1])
 
@@ -238,13 +244,14 @@ def _settle(slots: Slots, size: Float[Array, "O 3"], clutter: Slots, ground: Gro
     size = jnp.concatenate([jnp.asarray(size), clutter.size])
     height = ground_height(ground, x, y) + size[:, 2] / 2
     boxes = Boxes(jnp.stack([x, y, height], -1), size, yaw)
-    # Parked cars and clutter keep the crossing street free; traffic keeps a larger distance.
-    index, parked = np.arange(len(u)), _TRAFFIC + _PARKED + _YARDS
-    standing = ((index >= _TRAFFIC) & (index < parked)) | (index >= len(slots.u))
+    # Machines, parked cars and clutter keep the crossing street free; traffic keeps a larger distance.
+    index = np.arange(len(u)) - (len(slots.u) - _OBJECTS)
+    moving, parked = (index >= 0) & (index < _TRAFFIC), _TRAFFIC + _PARKED + _YARDS
+    standing = ((index < parked) & ~moving) | (index >= _OBJECTS)
     reach = (jnp.abs(jnp.cos(yaw)) * size[:, 0] + jnp.abs(jnp.sin(yaw)) * size[:, 1]) / 2
     in_street = standing & (jnp.abs(u - ground.crossing) < ground.crossing_half + reach + 0.5)
     wanted = jnp.concatenate([slots.present, clutter.present]) & ~in_street
-    present = keep_apart(boxes, wanted, margin=0.3, moving=index < _TRAFFIC)
+    present = keep_apart(boxes, wanted, margin=0.3, moving=moving)
     number = len(slots.u)
     objects = Objects(jax.tree.map(lambda leaf: leaf[:number], boxes), slots.kind, present[:number])
     return objects, clutter._replace(present=present[number:])

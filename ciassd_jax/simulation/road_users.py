@@ -1,4 +1,4 @@
-"""Vehicles and people built of solids, relative to the bottom centre of the object's box, with the front along +u.
+"""Vehicles, people and machines built of solids, relative to the bottom centre of their boxes, the front along +u.
 
 Every function takes the size of the box (length, width, height) in metres and `style`, uniform numbers in [0, 1] that
 vary the shape. The solids reach the faces of the box, as labelled objects do in KITTI.
@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from ciassd_jax.formats.errors import InputError
+from ciassd_jax.formats.kitti_rows import DONT_CARE
 from ciassd_jax.simulation.materials import material
 from ciassd_jax.simulation.solids import Number, Solids, block, ellipsoid, solid, stack
 from ciassd_jax.types import Array
@@ -18,18 +20,36 @@ from ciassd_jax.types import Array
 NUM_STYLES = 8
 KINDS = ("Car", "Van", "Truck", "Pedestrian", "Cyclist")
 CAR, VAN, TRUCK, PEDESTRIAN, CYCLIST = range(len(KINDS))
-# Mean and standard deviation of (length, width, height) in metres of KITTI's labels (the 155 reference frames).
+# Machines, the kind that a user names.
+MACHINE = len(KINDS)
+# Mean and standard deviation of (length, width, height) in metres: of KITTI's labels (the 155 reference frames), and
+# of machines.
 SIZES = (
     ((3.92, 1.62, 1.53), (0.40, 0.10, 0.12)),
     ((5.05, 1.90, 2.20), (0.70, 0.14, 0.28)),
     ((10.5, 2.60, 3.35), (2.80, 0.14, 0.35)),
     ((0.84, 0.65, 1.75), (0.20, 0.12, 0.12)),
     ((1.78, 0.60, 1.74), (0.14, 0.10, 0.09)),
+    ((2.60, 1.30, 2.10), (0.12, 0.06, 0.10)),
 )
 # Correlation of length, width and height in the labels of cars, used for every kind.
 _CORRELATION = np.array([[1, 0.33, 0.19], [0.33, 1, 0.31], [0.19, 0.31, 1]])
 _FACTOR = np.linalg.cholesky(_CORRELATION).astype(np.float32)
 _MAX_DEVIATION = 2.2
+
+
+def kind_names(own_class: str | None) -> tuple[str, ...]:
+    """Return the name of every kind, with `own_class` as that of machines.
+
+    Raises InputError if it is not one word, or the name of another kind.
+    """
+    if own_class is None:
+        return KINDS
+    if own_class.split() != [own_class] or not own_class.isprintable():
+        raise InputError(f"The class {own_class!r} is not one word; write it without spaces, such as Forklift.")
+    if own_class.lower() in map(str.lower, (*KINDS, DONT_CARE)):
+        raise InputError(f"The class {own_class} is in every simulated scene; choose another name, such as Forklift.")
+    return (*KINDS, own_class)
 
 
 def draw_size(draws: Float[Array, " 3"], kind: Int[Array, ""]) -> Float[Array, " 3"]:
@@ -48,6 +68,23 @@ def person(size: Float[Array, " 3"], kind: Int[Array, ""], style: Float[Array, "
     """Return the solids of a pedestrian or a cyclist."""
     built = [build(size, style) for build in (_pedestrian, _cyclist)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[kind - PEDESTRIAN], *built)
+
+
+def machine(size: Float[Array, " 3"], kind: Int[Array, ""], style: Float[Array, " n"]) -> Solids:
+    """Return the solids of a machine: a low body, a mast as high as the box in front of it, and a roof behind the mast.
+
+    There is one `kind`, so it is not read.
+    """
+    length, width, height = size
+    front, mast, body = length / 2, 0.3 + 0.2 * style[0], height * (0.4 + 0.1 * style[1])
+    shade = 0.5 + 0.5 * style[2]
+    return stack(
+        [
+            solid((0, 0, 0), (front - mast, front, width / 2, body, -0.1), material("paint"), shade=shade),
+            solid((0, 0, 0), (front, mast - front, 0.4 * width, height, -0.05), material("metal")),
+            solid((0, 0, height), (front - mast, 0.25 * length, 0.45 * width, 0.0, 0.12), material("metal")),
+        ]
+    )
 
 
 def _paint(style: Float[Array, " n"]) -> Array:

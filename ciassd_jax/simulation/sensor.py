@@ -1,4 +1,4 @@
-"""The sensor: what a Velodyne HDL-64E records of a scene."""
+"""The sensor, by default a Velodyne HDL-64E: what it records of a scene."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from ciassd_jax.simulation.layout import World
 from ciassd_jax.simulation.materials import MATERIALS
 from ciassd_jax.types import Array, PointCloud
 
+# What can be simulated: numbers of beams, heights above the ground and ranges in metres.
+_BEAMS, _HEIGHTS, _RANGES = range(TILE, 129, TILE), (0.5, 10.0), (5.0, 130.0)
+
 
 @dataclass(frozen=True)
 class Lidar:
@@ -24,7 +27,8 @@ class Lidar:
 
     `upper` and `lower` are blocks of beams: first and last elevation in degrees, and number. `columns` is the number of
     azimuths, evenly spaced over the full circle. `noise` is the standard deviation of the range and `max_range` the
-    largest range, in metres; `lost` is the fraction of rays that never return.
+    largest range, in metres; `lost` is the fraction of rays that never return. `height` is the mean height above the
+    ground in metres. Raises ValueError for numbers that cannot be simulated.
     """
 
     upper: tuple[float, float, int] = (2.4, -7.85, 32)
@@ -33,18 +37,44 @@ class Lidar:
     noise: float = 0.02
     lost: float = 0.01
     max_range: float = 80.0
+    height: float = 1.73
     # The capacity for pairs of a solid and a tile of rays (`casting.cast`).
     max_pairs: int = 4096
 
     def __post_init__(self) -> None:
         if (self.upper[2] + self.lower[2]) % TILE or self.columns % TILE or self.columns < TILE:
             raise ValueError(f"Lidar: the numbers of beams and of columns must be multiples of {TILE}.")
+        _check("height", self.height, _HEIGHTS)
+        _check("range", self.max_range, _RANGES)
+
+    @classmethod
+    def with_beams(cls, beams: int, **more: float | int) -> Lidar:
+        """Return a sensor whose `beams` cover the default elevations; `more` are other parameters.
+
+        Raises ValueError unless `beams` is a multiple of 16 from 16 to 128.
+        """
+        if beams not in _BEAMS:
+            near = sorted(sorted(_BEAMS, key=lambda number: abs(number - beams))[:2])
+            choice = f"choose a multiple of {TILE} up to {_BEAMS[-1]}, such as {near[0]} or {near[1]}"
+            raise ValueError(f"A sensor with {beams} beams cannot be simulated; {choice}.")
+        blocks = {"upper": (*cls.upper[:2], beams // 2), "lower": (*cls.lower[:2], beams // 2)}
+        return cls(**blocks, max_pairs=max(cls.max_pairs, 64 * beams), **more)  # type: ignore[arg-type]
+
+    @property
+    def label_range(self) -> float:
+        """The distance in metres from which objects are DontCare; none for the default range or more, as in KITTI."""
+        return self.max_range if self.max_range < Lidar.max_range else np.inf
 
     def rays(self) -> Rays:
         """Return the directions of the rays; the first column points backwards."""
         elevation = np.deg2rad(np.concatenate([np.linspace(*self.upper), np.linspace(*self.lower)]))
         azimuth = (np.arange(self.columns) / self.columns * 2 - 1) * np.pi
         return Rays(jnp.asarray(azimuth, jnp.float32), jnp.asarray(np.tan(elevation), jnp.float32))
+
+
+def _check(what: str, value: float, limits: tuple[float, float]) -> None:
+    if not limits[0] <= value <= limits[1]:
+        raise ValueError(f"A sensor's {what} cannot be {value:g} m; choose {limits[0]:g} to {limits[1]:g} m.")
 
 
 class Draws(NamedTuple):

@@ -21,6 +21,7 @@ from ciassd_jax.formats.kitti_rows import ObjectRow, write_rows
 from ciassd_jax.formats.points import write_bin
 from ciassd_jax.formats.writing import check_folder, replacing, write_text
 from ciassd_jax.ops.camera import project
+from ciassd_jax.simulation.road_users import kind_names
 from ciassd_jax.simulation.sensor import Lidar
 from ciassd_jax.simulation.streets import make_frame, split_synthetic
 from ciassd_jax.simulation.virtual_camera import calibration_text, virtual_camera
@@ -39,15 +40,17 @@ def write_synthetic(
     seed: int,
     overwrite: bool = False,
     lidar: Lidar | None = None,
+    own_class: str | None = None,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> int:
     """Write frames 0 to `frames` - 1 of a seed as OUT/training and OUT/ImageSets; returns the sum of `dropped` pairs.
 
-    The splits are those of `split_synthetic`. `overwrite` replaces what this function wrote there before. `track` wraps
-    the iteration over the frames, for a progress bar. Raises InputError for a folder that cannot be used, and without
-    pillow.
+    The splits are those of `split_synthetic`; `lidar` and `own_class` are as in `make_frame`. `overwrite` replaces what
+    this function wrote there before. `track` wraps the iteration over the frames, for a progress bar. Raises InputError
+    for a folder or an `own_class` that cannot be used, and without pillow.
     """
     folder = Path(out)
+    kind_names(own_class)
     _require_pillow()
     _clear(folder, overwrite)
     write_text(folder / MARK, f"{frames} synthetic frames of seed {seed}, written by `ciassd data synth`")
@@ -55,7 +58,7 @@ def write_synthetic(
     for split in ("train", "val", "trainval"):
         with replacing(folder / "ImageSets" / f"{split}.txt") as temporary:
             temporary.write_text("".join(f"{name}\n" for name in splits[split]))
-    made = make_frames(seed, range(frames), lidar)
+    made = make_frames(seed, range(frames), lidar, own_class)
     total = 0
     for _ in track(range(frames)):
         frame, dropped = next(made)
@@ -64,13 +67,15 @@ def write_synthetic(
     return total
 
 
-def make_frames(seed: int, indices: Iterable[int], lidar: Lidar | None = None) -> Iterator[tuple[Frame, int]]:
+def make_frames(
+    seed: int, indices: Iterable[int], lidar: Lidar | None = None, own_class: str | None = None
+) -> Iterator[tuple[Frame, int]]:
     """Yield `make_frame` of each index in order, with one thread per core."""
     threads = os.cpu_count() or 1
     pending: deque = deque()
     with ThreadPoolExecutor(threads) as pool:
         for index in indices:
-            pending.append(pool.submit(make_frame, seed, index, lidar))
+            pending.append(pool.submit(make_frame, seed, index, lidar, own_class))
             if len(pending) > threads:
                 yield pending.popleft().result()
         while pending:

@@ -16,7 +16,8 @@ from ciassd_jax.data.kitti import crop_to_view, kitti_frame
 from ciassd_jax.formats.errors import DroppedWarning
 from ciassd_jax.simulation.casting import count_rays
 from ciassd_jax.simulation.label_rows import label_rows
-from ciassd_jax.simulation.layout import Objects, World, sample_world
+from ciassd_jax.simulation.layout import NUM_MACHINES, Objects, World, sample_world
+from ciassd_jax.simulation.road_users import kind_names
 from ciassd_jax.simulation.sensor import Lidar, scan
 from ciassd_jax.simulation.solids import Solids, block
 from ciassd_jax.simulation.virtual_camera import virtual_camera
@@ -46,10 +47,13 @@ def frame_key(seed: int, index: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), index)
 
 
-def simulate(key: jax.Array, lidar: Lidar) -> Simulated:
-    """Draw one scene and scan it. Use `vmap` for a batch of keys; `frame_key` returns that of a frame."""
+def simulate(key: jax.Array, lidar: Lidar, *, machines: bool = False) -> Simulated:
+    """Draw one scene, with or without `machines`, and scan it.
+
+    Use `vmap` for a batch of keys; `frame_key` returns that of a frame.
+    """
     for_world, for_scan = jax.random.split(key)
-    return observe(for_scan, sample_world(for_world), lidar)
+    return observe(for_scan, sample_world(for_world, lidar.height, NUM_MACHINES * machines), lidar)
 
 
 def observe(key: jax.Array, world: World, lidar: Lidar) -> Simulated:
@@ -67,28 +71,34 @@ def _count(objects: Objects, distance: Array, lidar: Lidar) -> tuple[Array, Arra
     return count_rays(_box_solids(objects), rays, flat, _MAX_PAIRS)
 
 
-def make_frame(seed: int, index: int, lidar: Lidar | None = None) -> tuple[Frame, int]:
-    """Simulate frame `index` of `seed`, which depends on these two numbers and the sensor alone.
+def make_frame(seed: int, index: int, lidar: Lidar | None = None, own_class: str | None = None) -> tuple[Frame, int]:
+    """Simulate frame `index` of `seed`, which depends on the arguments alone.
 
-    Returns the frame, with the full cloud of 360 degrees and all label rows, and `Simulated.dropped`.
+    With `own_class` there are machines too, labelled with this name. Returns the frame, with the full cloud of
+    360 degrees and all label rows, and `Simulated.dropped`. Raises InputError for an `own_class` that is not one word.
     """
-    simulated = jax.device_get(simulate(frame_key(seed, index), lidar or Lidar()))
+    lidar, names = lidar or Lidar(), kind_names(own_class)
+    simulated = jax.device_get(simulate(frame_key(seed, index), lidar, machines=own_class is not None))
     present = simulated.objects.present
     boxes = jax.tree.map(lambda leaf: leaf[present].astype(np.float64), simulated.objects.boxes)
     counts = (simulated.objects.kind, simulated.through, simulated.arriving)
     kind, through, arriving = (values[present] for values in counts)
     camera = virtual_camera()
-    rows = label_rows(boxes, kind, through, arriving, camera)
+    rows = label_rows(boxes, kind, through, arriving, camera, names, lidar.label_range)
     points = simulated.cloud.points[: simulated.cloud.count]
     return kitti_frame(f"{index:06d}", points, tuple(rows), camera), int(simulated.dropped)
 
 
-def open_synthetic(seed: int, frames: int, lidar: Lidar | None = None) -> Dataset:
+def open_synthetic(seed: int, frames: int, lidar: Lidar | None = None, own_class: str | None = None) -> Dataset:
     """Return a data set of `frames` synthetic frames, named 000000, 000001, ..., which are simulated as they are read.
 
-    Except for the rounding of the label's text, its frames are those that `write_synthetic` writes for the same seed.
+    `lidar` is the sensor, by default an HDL-64E, and `own_class` the name of a class of machines, as in `make_frame`.
+    Except for the rounding of the label's text, the frames are those that `write_synthetic` writes for the same
+    arguments. Raises InputError for an `own_class` that is not one word.
     """
-    return Dataset(split_synthetic(frames)["all"], partial(read_synthetic_frame, seed=seed, lidar=lidar or Lidar()))
+    kind_names(own_class)
+    read = partial(read_synthetic_frame, seed=seed, lidar=lidar or Lidar(), own_class=own_class)
+    return Dataset(split_synthetic(frames)["all"], read)
 
 
 def split_synthetic(frames: int) -> dict[str, tuple[str, ...]]:
@@ -98,9 +108,9 @@ def split_synthetic(frames: int) -> dict[str, tuple[str, ...]]:
     return {"train": training, "val": names[3::4], "trainval": names, "all": names}
 
 
-def read_synthetic_frame(name: str, *, seed: int, lidar: Lidar) -> Frame:
+def read_synthetic_frame(name: str, *, seed: int, lidar: Lidar, own_class: str | None = None) -> Frame:
     """Simulate the frame of that name, cropped to the camera's view; a DroppedWarning counts pairs over capacity."""
-    frame, dropped = make_frame(seed, int(name), lidar)
+    frame, dropped = make_frame(seed, int(name), lidar, own_class)
     if dropped:
         text = f"Frame {name} of seed {seed} is incomplete: {dropped} pairs of a solid and a tile are over capacity."
         warnings.warn(text, DroppedWarning, stacklevel=2)

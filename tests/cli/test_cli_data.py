@@ -12,7 +12,7 @@ from ciassd_jax.data.gt_sampling import open_database
 from ciassd_jax.evaluation.dataset_check import check_dataset
 from ciassd_jax.formats.kitti_rows import read_rows, write_rows
 from ciassd_jax.formats.points import write_bin
-from ciassd_jax.simulation import Lidar
+from ciassd_jax.simulation import Lidar, open_synthetic
 
 
 def test_sound_data_pass_the_check(run: Any, tmp_path: Path) -> None:
@@ -117,9 +117,7 @@ def test_prepare_cannot_reduce_without_a_camera(run: Any, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_synth_writes_a_folder_that_passes_the_check(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Fewer columns than the real sensor has: the test is of the command.
-    monkeypatch.setattr("ciassd_jax.simulation.streets.Lidar", lambda: Lidar(columns=512))
+def test_synth_writes_a_folder_that_passes_the_check(run: Any, tmp_path: Path) -> None:
     root = tmp_path / "synth"
     result = run("data", "synth", root, "--frames", 4, "--seed", 1)
     assert (result.code, result.out, result.err) == (0, f"Wrote 4 frames to {root}.\n", "")
@@ -133,11 +131,34 @@ def test_synth_writes_a_folder_that_passes_the_check(run: Any, tmp_path: Path, m
     assert [path.name for path in (root / "training/velodyne").iterdir()] == ["000000.bin"]
 
 
+@pytest.mark.slow
+def test_synth_simulates_another_sensor_and_an_own_class(run: Any, tmp_path: Path) -> None:
+    options = ("--beams", 16, "--sensor-height", 2.1, "--max-range", 40, "--class", "Forklift")
+    assert run("data", "synth", tmp_path, "--frames", 2, *options).code == 0
+    read = open_dataset(tmp_path, "all")
+    made = open_synthetic(0, 2, Lidar.with_beams(16, height=2.1, max_range=40.0), "Forklift")
+    for index in range(2):
+        np.testing.assert_array_equal(read.read(index).points, made.read(index).points)
+        assert read.read(index).names == made.read(index).names
+    assert "Forklift" in read.read(0).names + read.read(1).names
+
+
+def test_synth_without_options_simulates_the_usual_sensor(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[dict] = []
+    monkeypatch.setattr("ciassd_jax.cli.data_synth.write_synthetic", lambda out, **given: calls.append(given))
+    assert run("data", "synth", tmp_path).code == 0
+    assert [(given["lidar"], given["own_class"]) for given in calls] == [(Lidar(), None)]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (("--frames", 0), "error: --frames is 0; simulate at least 1 frame.\n"),
         (("--seed", -1), "error: --seed is -1; choose one from 0 to 2147483647.\n"),
+        (("--sensor-height", 0), "error: A sensor's height cannot be 0 m; choose 0.5 to 10 m.\n"),
+        (("--class", "a b"), "error: The class 'a b' is not one word; write it without spaces, such as Forklift.\n"),
     ],
 )
 def test_synth_refuses_senseless_numbers(run: Any, tmp_path: Path, options: tuple, message: str) -> None:

@@ -31,7 +31,18 @@ from ciassd_jax.simulation.ground import Ground, cast_ground, ground_height
 from ciassd_jax.simulation.label_rows import label_rows
 from ciassd_jax.simulation.layout import Objects, World, sample_world
 from ciassd_jax.simulation.materials import material
-from ciassd_jax.simulation.road_users import CAR, CYCLIST, NUM_STYLES, PEDESTRIAN, TRUCK, VAN, person, vehicle
+from ciassd_jax.simulation.road_users import (
+    CAR,
+    CYCLIST,
+    MACHINE,
+    NUM_STYLES,
+    PEDESTRIAN,
+    TRUCK,
+    VAN,
+    machine,
+    person,
+    vehicle,
+)
 from ciassd_jax.simulation.sensor import Sight, scan
 from ciassd_jax.simulation.solids import Solids, block, column, cross, ellipsoid, extent, place, stack
 from ciassd_jax.simulation.streets import observe
@@ -41,13 +52,16 @@ from ciassd_jax.types import Boxes
 # The beams of the real sensor and few columns; every scan below has the shapes of `small_world` and runs one program.
 SMALL = Lidar(columns=512, noise=0.0, lost=0.0)
 WALL = material("wall")
-build_person, build_vehicle, extent_of = jax.jit(person), jax.jit(vehicle), jax.jit(extent)
+# Another sensor, and fewer columns of it.
+OTHER = Lidar.with_beams(32, columns=512, height=2.1, max_range=40.0)
+build_person, build_vehicle, build_machine = jax.jit(person), jax.jit(vehicle), jax.jit(machine)
+extent_of = jax.jit(extent)
 hit_ground, height_of = jax.jit(cast_ground), jax.jit(ground_height)
 
 
 @cache
 def small_world(seed: int = 0) -> World:
-    return jax.device_get(sample_world(jax.random.key(seed)))
+    return jax.device_get(sample_world(jax.random.key(seed), SMALL.height))
 
 
 def flat_ground(sensor_height: float = 1.73) -> Ground:
@@ -192,11 +206,12 @@ def test_sloping_ground_with_kerbs_is_met_on_its_surface() -> None:
         (TRUCK, (10.0, 2.6, 3.4)),
         (PEDESTRIAN, (0.8, 0.6, 1.75)),
         (CYCLIST, (1.8, 0.6, 1.75)),
+        (MACHINE, (2.6, 1.3, 2.1)),
     ],
 )
 def test_objects_fill_their_boxes(kind: int, size: tuple[float, float, float]) -> None:
     """For any style, the solids of an object stay inside its box and together reach its faces."""
-    build = build_person if kind in (PEDESTRIAN, CYCLIST) else build_vehicle
+    build = {PEDESTRIAN: build_person, CYCLIST: build_person, MACHINE: build_machine}.get(kind, build_vehicle)
     length, width, height = size
     for style in np.random.default_rng(0).uniform(size=(8, NUM_STYLES)).astype(np.float32):
         solids = jax.device_get(build(np.float32(size), np.int32(kind), style))
@@ -276,6 +291,13 @@ def test_few_rays_make_no_label_but_a_region_not_to_care_about() -> None:
     (row,) = label_rows(box, np.array([CAR]), np.array([2]), np.array([2]), virtual_camera())
     assert (row.type, row.truncated, row.occluded, row.location) == ("DontCare", -1, -1, (-1000, -1000, -1000))
     assert row.bbox[2] > row.bbox[0]
+
+
+def test_objects_out_of_range_are_regions_not_to_care_about() -> None:
+    boxes = Boxes(np.array([[30.0, 0, -1], [45.0, 4, -1]]), np.array([[4.0, 1.7, 1.5]] * 2), np.zeros(2))
+    rays, kinds = np.array([100, 100]), np.array([CAR, CAR])
+    rows = label_rows(boxes, kinds, rays, rays, virtual_camera(), max_range=OTHER.label_range)
+    assert [row.type for row in rows] == ["Car", "DontCare"]
 
 
 def test_objects_stand_apart_on_the_ground() -> None:
@@ -401,3 +423,74 @@ def test_pillow_is_asked_for_before_anything_is_written(tmp_path: Path, monkeypa
 def test_numbers_of_rays_that_are_no_whole_tiles_are_refused() -> None:
     with pytest.raises(ValueError, match="multiples of 16"):
         Lidar(columns=100)
+
+
+def test_beams_cover_the_same_elevations() -> None:
+    assert Lidar.with_beams(64) == Lidar()
+    full = Lidar().rays().tangent
+    for beams in (16, 32, 48, 128):
+        tangent = Lidar.with_beams(beams).rays().tangent
+        assert len(tangent) == beams
+        np.testing.assert_array_equal(tangent[jnp.array([0, -1])], full[jnp.array([0, -1])])
+        assert (jnp.diff(tangent) < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"beams": 40}, "40 beams .* a multiple of 16 up to 128, such as 32 or 48"),
+        ({"beams": 0}, "0 beams .* such as 16 or 32"),
+        ({"beams": 200}, "200 beams .* such as 112 or 128"),
+        ({"beams": 32, "height": 0.0}, "height cannot be 0 m; choose 0.5 to 10 m"),
+        ({"beams": 32, "height": np.nan}, "height cannot be nan m"),
+        ({"beams": 32, "max_range": 500.0}, "range cannot be 500 m; choose 5 to 130 m"),
+    ],
+)
+def test_sensors_that_cannot_be_simulated_are_refused(numbers: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Lidar.with_beams(**numbers)
+
+
+def test_a_higher_sensor_sees_the_same_street_from_above() -> None:
+    low, high = small_world(), jax.device_get(sample_world(jax.random.key(0), OTHER.height))
+    present, lower = low.objects.present, SMALL.height - OTHER.height
+    assert low.ground.sensor_height - high.ground.sensor_height == pytest.approx(lower, abs=1e-6)
+    np.testing.assert_array_equal(high.objects.present, present)
+    moved = (high.objects.boxes.center - low.objects.boxes.center)[present]
+    np.testing.assert_allclose(moved, np.broadcast_to([0, 0, lower], moved.shape), atol=1e-5)
+
+
+def test_an_own_class_stands_among_cars_and_people() -> None:
+    frames = [open_synthetic(0, 12, OTHER, "Forklift").read(index) for index in range(12)]
+    names = [name for frame in frames for name in frame.names]
+    assert names.count("Forklift") >= 12
+    assert {"Car", "Pedestrian"} < set(names)
+    turns = []
+    for frame in frames:
+        own = np.array([name == "Forklift" for name in frame.names], bool)
+        boxes = jax.tree.map(lambda leaf, own=own: leaf[own], frame.boxes)
+        assert np.linalg.norm(boxes.center, axis=-1).max(initial=0) < OTHER.max_range
+        assert np.linalg.norm(frame.points[:, :3], axis=-1).max() < OTHER.max_range + 0.1
+        grown = boxes._replace(size=boxes.size + 0.1)
+        assert (points_in_boxes(frame.points[:, :3].astype(np.float64), grown).sum(1) > 0).all()
+        turns.extend(boxes.yaw)
+    # Four quarters of the circle.
+    assert len(np.unique(np.floor(np.array(turns) / (np.pi / 2)) % 4)) == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Fork lift", "'Fork lift' is not one word"),
+        ("", "'' is not one word"),
+        ("Fork\x00lift", "is not one word"),
+        ("car", "car is in every simulated scene"),
+        ("DONTCARE", "DONTCARE is in every simulated scene"),
+    ],
+)
+def test_names_that_no_own_class_can_have_are_refused(tmp_path: Path, name: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        open_synthetic(0, 1, SMALL, name)
+    with pytest.raises(InputError, match=message):
+        write_synthetic(tmp_path / "out", frames=1, seed=0, lidar=SMALL, own_class=name)
+    assert not (tmp_path / "out").exists()
