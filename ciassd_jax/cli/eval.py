@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -26,13 +27,17 @@ class Text:
     """Folder of label files NNNNNN.txt, such as training/label_2."""
     results: Annotated[Path, tyro.conf.Positional]
     """Folder of result files with the same names; frames without a result file are not evaluated."""
-    overlap: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CLASS=OVERLAP", help_behavior_hint="")] = ()
+    overlap: Annotated[
+        tuple[tuple[str, ...], ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="CLASS=OVERLAP ...", help_behavior_hint=""),
+    ] = ()
     """Also evaluate other classes, such as Vehicle=0.5 Forklift=0.4, or KITTI's at another overlap."""
     json: Unset[Path] = None
     """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
 
     def run(self) -> int:
-        limits = _add_overlaps(LIMITS, self.overlap)
+        limits = _add_overlaps(LIMITS, chain.from_iterable(self.overlap))
         if self.json is not None:
             check_folder(self.json.parent)
         with warnings_as_lines(self.results):
@@ -43,13 +48,13 @@ class Text:
         print(format_report(evaluation))
         if evaluation.left_out:
             name = next(iter(evaluation.left_out))
-            print(f"\n--overlap {name}=0.5 evaluates {name} at an overlap of 0.5.")
+            print(f"\n--overlap {name}=0.5 evaluates {name}, at an overlap of 0.5.")
         if self.json is not None:
             print(f"Wrote {self.json}.")
         return 0
 
 
-def _add_overlaps(limits: Limits, given: Sequence[str]) -> Limits:
+def _add_overlaps(limits: Limits, given: Iterable[str]) -> Limits:
     """Return the limits with those of texts CLASS=OVERLAP, which replace those of a class of the same name."""
     added: dict[str, tuple[float, ...]] = {}
     for text in given:

@@ -74,6 +74,49 @@ def test_bad_input_is_one_sentence(
     assert expected[what] in said
 
 
+def own_class(folders: tuple[Path, Path]) -> list[str]:
+    """The arguments for the folders, whose cars become vehicles."""
+    for path in (path for folder in folders for path in folder.iterdir()):
+        path.write_text(path.read_text().replace("Car", "Vehicle"))
+    return ["eval", "txt", *map(str, folders)]
+
+
+def test_a_class_of_ones_own(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    """What the output advises for a type that is left out evaluates it."""
+    arguments = own_class(folders)
+    assert main(arguments) == 0
+    shown = capsys.readouterr().out
+    assert "\nNot evaluated: 2 labels and 2 detections of Vehicle.\n" in shown
+    advice = re.search(r"^(--overlap Vehicle=\S+) evaluates Vehicle", shown, re.MULTILINE)[1]
+    assert main([*arguments, *advice.split(), "Forklift=.4", "--overlap", "car=0.6"]) == 0
+    shown = capsys.readouterr().out
+    assert "Vehicle AP@0.50, 0.50, 0.50:\nbbox AP:9.0909, 9.0909, 9.0909\n" in shown
+    assert re.search(r"^Vehicle +3d +0\.50 +2\.50 ", shown, re.MULTILINE)
+    assert re.findall(r"^(\w+) +not evaluated", shown, re.MULTILINE) == ["Pedestrian", "Cyclist", "Forklift", "car"]
+    assert "Not evaluated:" not in shown
+
+
+@pytest.mark.parametrize("given", ["Vehicle", "Vehicle=2", "Vehicle=0", "=0.5", "Vehicle=", "Vehicle=nan", "A=.5 a=.4"])
+def test_overlaps_that_cannot_be_used(
+    given: str, folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*own_class(folders), "--overlap", *given.split()]) == 2
+    shown, said = capsys.readouterr()
+    assert shown == ""
+    assert re.fullmatch(
+        r"error: --overlap .*(write CLASS=OVERLAP .* such as Vehicle=0\.5|give each class once)\.\n", said
+    )
+
+
+def test_labels_without_image_boxes(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    for path in folders[0].iterdir():
+        path.write_text(re.sub(r"10\.0000 20\.0000 110\.0000 80\.0000", "0 0 0 0", path.read_text()))
+    assert main(["eval", "txt", *map(str, folders)]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"^Car +3d +0\.70 +2\.50 +2\.50 +2\.50", shown, re.MULTILINE)
+    assert "None of the 2 labels has an image box, so none has KITTI's difficulty: every label counts" in shown
+
+
 def test_nothing_to_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval"]) == 2
     assert "--weights FILE or --workdir FOLDER, or compare files with `ciassd eval txt" in capsys.readouterr().err
@@ -133,7 +176,7 @@ def test_the_weights_of_a_training_and_the_environments_data(
     assert json.loads(out.read_text())["Car"]["3d"]["R40"]["0.70"] is None
     assert main(arguments) == 0
     shown, _ = capsys.readouterr()
-    assert "No camera: difficulty is by the number of points" in shown
+    assert ": difficulty is by the number of points in an object's box," in shown
     assert json.loads(out.read_text())["Car"]["3d"]["R40"]["0.70"] is not None
 
 
@@ -216,7 +259,7 @@ def test_bad_options_are_one_sentence_and_leave_nothing(
 
 def test_files_take_no_option_of_a_network(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", "--split", "train", "txt", *map(str, folders)]) == 2
-    assert capsys.readouterr().err.startswith("error: `ciassd eval txt` has one option, --json")
+    assert capsys.readouterr().err.startswith("error: `ciassd eval txt LABELS RESULTS` has --json and --overlap only;")
 
 
 def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:

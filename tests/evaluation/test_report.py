@@ -108,7 +108,8 @@ def test_without_a_camera_the_report_says_so() -> None:
     detections = [frame._replace(image_boxes=None, alpha=None, points=np.array([70])) for frame in detections]
     evaluation = evaluate(truths, detections)
     text = format_tables(evaluation)
-    assert "No camera: difficulty is by the number of points" in text
+    assert "None of the 1 labels has an image box" in text
+    assert ": difficulty is by the number of points in an object's box," in text
     assert re.search(r"^Car +3d +20-100 points ", text, re.MULTILINE)
     assert "Nothing by number of points" not in text
     assert to_json(evaluation)["Car"]["bbox"]["R40"] == {"0.70": None}
