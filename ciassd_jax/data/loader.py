@@ -20,14 +20,16 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Int, UInt8
 
 from ciassd_jax.config import Config
 from ciassd_jax.data.augment import augment, keep_targets, scene_key
-from ciassd_jax.data.frames import Dataset
+from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.data.gt_sampling import ObjectDatabase, no_objects, sample_objects
+from ciassd_jax.data.notes import encode_warnings, give_new
 from ciassd_jax.data.scenes import pad_frame
 from ciassd_jax.data.workers import Watched
+from ciassd_jax.formats.errors import collected_warnings, warn_of_file
 from ciassd_jax.formats.points import check_intensity
 from ciassd_jax.types import Array, SampledObjects, Scene
 
@@ -51,11 +53,12 @@ class LoaderState(NamedTuple):
 
 
 class HostScene(NamedTuple):
-    """A scene before the device augments it; without `objects` it is not augmented."""
+    """A scene before the device augments it; without `objects` it is not augmented. `notes` are its warnings."""
 
     scene: Scene
     objects: SampledObjects | None
     epoch: Int[Array, "*b"]
+    notes: UInt8[Array, "*b bytes"]
 
 
 @dataclass(frozen=True)
@@ -72,10 +75,18 @@ class Stream:
         """Read, sample and pad the scene at a position; raises InputError for a file that cannot be used."""
         epoch, place = divmod(position, len(self.dataset))
         index = int(epoch_order(self.seed, epoch, len(self.dataset))[place])
-        frame = self.dataset.read(index)
-        points, _ = check_intensity(frame.points, self.config.input.intensity_scale, f"Frame {frame.name}")
-        scene = pad_frame(frame._replace(points=points), index, self.config)
-        return HostScene(scene, self._sample(frame.names, epoch, index), np.array(epoch, np.int32))
+        with collected_warnings() as found:
+            frame = self.dataset.read(index)
+            scene = pad_frame(self._check_intensity(frame), index, self.config)
+        objects = self._sample(frame.names, epoch, index)
+        return HostScene(scene, objects, np.array(epoch, np.int32), encode_warnings(found))
+
+    def _check_intensity(self, frame: Frame) -> Frame:
+        source, scale = f"Frame {frame.name}", self.config.input.intensity_scale
+        points, clipped = check_intensity(frame.points, scale, source)
+        if clipped:
+            warn_of_file(f"{source}: {clipped} intensities outside [0, {scale:g}] were clipped.", source)
+        return frame._replace(points=points)
 
     def _sample(self, names: tuple[str, ...], epoch: int, index: int) -> SampledObjects | None:
         if not self.augmented:
@@ -162,19 +173,21 @@ def finish_scenes(host: HostScene, seed: Int[Array, ""], config: Config) -> Scen
             return keep_targets(scene, minimum=minimum, maximum=maximum)
         return augment(scene_key(seed, epoch, scene.frame), scene, objects, config)
 
-    return jax.vmap(finish)(*host)
+    return jax.vmap(finish)(host.scene, host.objects, host.epoch)
 
 
 class Batches(Iterator[Scene]):
     """An endless iterator over batched scenes on the device; a `with` block, or `close`, ends its workers.
 
-    Raises InputError, which names the file, for a frame that cannot be used, and WorkerError for a worker that died.
-    The state is then still that of the batches taken, and the next batch restarts the workers.
+    Gives one FormatWarning for each kind of problem with the frames. Raises InputError, which names the file, for a
+    frame that cannot be used, and WorkerError for a worker that died. The state is then still that of the batches
+    taken, and the next batch restarts the workers.
     """
 
     def __init__(self, rows: Rows, *, workers: int = 0, start: int = 0) -> None:
         self._rows, self._workers, self._taken = rows, workers, start
         self._host: list[Any] = []
+        self._told: set[str] = set()
         self._ready: deque[Scene] = deque()
         # Runs before multiprocessing ends the workers itself, which would leave shared memory behind.
         Finalize(self, _close_host, (self._host,), exitpriority=100)
@@ -196,6 +209,7 @@ class Batches(Iterator[Scene]):
         while len(self._ready) < 1 + _AHEAD:
             # Copied, because the device may still read an array after the workers reuse its shared memory.
             host = jax.tree.map(np.array, next(self._host[0]))
+            give_new(host.notes, self._told, stacklevel=4)
             self._ready.append(finish_scenes(host, np.array(stream.seed, np.int32), stream.config))
 
     @property

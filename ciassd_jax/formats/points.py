@@ -7,14 +7,13 @@
 from __future__ import annotations
 
 import io
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike, read_bytes
+from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes, warn_of_file
 from ciassd_jax.formats.layout import guess_columns, looks_like_float64
 from ciassd_jax.formats.pcd import read_pcd
 from ciassd_jax.formats.ply import read_ply
@@ -150,7 +149,7 @@ def _pick_columns(columns: NamedColumns, path: Pathlike) -> Float32[np.ndarray, 
         points[:, index] = named[name]
     if len(picked) == 3:
         text = f"{path} has no intensity among its columns {found}; 0 is used instead."
-        warnings.warn(text, FormatWarning, stacklevel=4)
+        warn_of_file(text, path, stacklevel=5)
     return points
 
 
@@ -174,8 +173,9 @@ def _read_bin(data: bytes, path: Pathlike, width: int, names: tuple[str, ...]) -
 
 def _name_columns(array: np.ndarray, path: Pathlike, width: int | None, names: tuple[str, ...]) -> NamedColumns:
     """Return the columns of an array of numbers, or the fields of a structured one."""
-    if array.dtype.names:
-        return [(name, array[name].ravel()) for name in array.dtype.names if array.dtype[name].kind in "fiu"]
+    fields = [name for name in array.dtype.names or () if array.dtype[name].kind in "fiu"]
+    if fields:
+        return [(name, array[name].ravel()) for name in fields]
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
         raise InputError(
             f"{path} holds an array of shape {array.shape} and type {array.dtype}; "

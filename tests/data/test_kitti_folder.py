@@ -108,7 +108,9 @@ def test_a_missing_image_is_warned_of_once_where_clouds_are_cropped(tmp_path: Pa
     for name in NAMES[:2]:
         (root / f"training/image_2/{name}.png").unlink()
         (root / f"training/calib/{name}.txt").write_text(KITTI_CALIBRATION)
-    message = r"image_2/NAME\.png or \.jpg or \.jpeg is missing for 2 of 3 frames whose clouds are cropped to the image; the usual size"
+    message = (
+        r"NAME\.png or \.jpg or \.jpeg is missing for 2 of 3 frames whose clouds are cropped to the image; the usual"
+    )
     with pytest.warns(FormatWarning, match=message):
         dataset = open_dataset(root, "all")
     camera = dataset.read(0).camera

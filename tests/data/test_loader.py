@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,7 +13,7 @@ import chex
 import jax
 import numpy as np
 import pytest
-from mini_folders import NAMES, write_kitti, write_split
+from mini_folders import NAMES, write_custom, write_kitti, write_split
 
 from ciassd_jax import Config, Scene, car_lite, make_batches, open_dataset, tiny
 from ciassd_jax.config import AugmentationConfig, DataConfig
@@ -28,7 +29,7 @@ from ciassd_jax.data.gt_sampling import (
 from ciassd_jax.data.loader import Batches, LoaderState, Rows, Stream, epoch_order, finish_scenes
 from ciassd_jax.data.scenes import pad_frame
 from ciassd_jax.data.workers import WorkerError
-from ciassd_jax.formats.errors import InputError
+from ciassd_jax.formats.errors import FormatWarning, InputError
 
 CONFIG = replace(tiny(), data=replace(tiny().data, max_points=1024, max_gt_sampling_points=512))
 # With three frames, batches start at the beginning and in the middle of an epoch.
@@ -282,3 +283,43 @@ def test_real_frames_fit(shared: Path) -> None:
     scenes = [pad_frame(dataset.read(index), index, config) for index in range(len(dataset))]
     cut = [np.sum([scene.points_cut, scene.boxes_cut, scene.objects_cut]) for scene in scenes]
     assert not np.any(cut)
+
+
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_each_kind_of_problem_is_told_once(tmp_path: Path, workers: int) -> None:
+    """By the program that takes the batches, whoever reads the frames."""
+    root = write_custom(tmp_path, names=tuple("abcd"))
+    for path in (root / "points").iterdir():
+        np.save(path, np.load(path)[:, :3])
+    for path in (root / "labels").iterdir():
+        path.write_text(path.read_text().replace("Car", "car"))
+    points = np.load(root / "points/c.npy")
+    points[0] = np.nan
+    np.save(root / "points/c.npy", points)
+    with pytest.warns(FormatWarning) as caught:
+        take(make_batches(open_dataset(root, "train"), CONFIG, seed=0, batch_size=2, workers=workers), 6)
+    *texts, case = sorted((str(one.message) for one in caught), key=lambda text: text.startswith("Labels"))
+    assert case == "Labels of type car count as Car, because case does not matter."
+    lacking, broken = sorted(texts, key=lambda text: "not finite" in text)
+    assert re.fullmatch(rf"{root}/points/.\.npy has no intensity .* 0 is used instead\.", lacking)
+    assert broken == f"{root}/points/c.npy: 1 of 980 points are not finite; they were left out."
+
+
+def test_a_few_intensities_out_of_scale_are_clipped_with_a_warning_and_many_are_refused(tmp_path: Path) -> None:
+    root = write_custom(tmp_path, names=("a",))
+    points = np.load(root / "points/a.npy")
+    points[:3, 3] = (4, -1, 2)
+    np.save(root / "points/a.npy", points)
+    message = r"Frame a: 3 intensities outside \[0, 1\] were clipped\."
+    with (
+        pytest.warns(FormatWarning, match=message),
+        make_batches(open_dataset(root, "train"), CONFIG, seed=0, batch_size=1, augmented=False) as batches,
+    ):
+        intensity = np.asarray(next(batches).cloud.points[0, :3, 3])
+    np.testing.assert_array_equal(intensity, [1, 0, 1])
+    np.save(root / "points/a.npy", points * [1, 1, 1, 255])
+    with (
+        pytest.raises(InputError, match="`intensity_scale`"),
+        make_batches(open_dataset(root, "train"), CONFIG, seed=0, batch_size=1) as batches,
+    ):
+        next(batches)
