@@ -72,22 +72,35 @@ def silenced(*loggers: str) -> Iterator[None]:
 
 @contextmanager
 def warnings_as_lines(source: Path | str) -> Iterator[None]:
-    """Print the package's own warnings as one line that names the input; leave all others as they are."""
+    """Print the package's own warnings as one line that names the input; leave all others as they are.
+
+    Of warnings that differ only in file and numbers, the first is printed and the others are counted at the end.
+    """
     from tqdm.auto import tqdm
 
+    kinds: dict[str, list[str]] = {}
+
     def show(message, category, *rest, **more):  # type: ignore[no-untyped-def]
-        if issubclass(category, DroppedWarning | FormatWarning):
-            named = message if issubclass(category, FormatWarning) else f"{source}: {message}"
-            tqdm.write(f"warning: {describe(named)}", file=sys.stderr)
-        else:
+        if not issubclass(category, DroppedWarning | FormatWarning):
             before(message, category, *rest, **more)
+            return
+        text = describe(message if issubclass(category, FormatWarning) else f"{source}: {message}")
+        alike = kinds.setdefault(getattr(message, "kind", text), [])
+        alike.append(text)
+        if len(alike) == 1:
+            tqdm.write(f"warning: {text}", file=sys.stderr)
 
     before = warnings.showwarning
     with warnings.catch_warnings():
         warnings.simplefilter("always", DroppedWarning)
         warnings.simplefilter("always", FormatWarning)
         warnings.showwarning = show
-        yield
+        try:
+            yield
+        finally:
+            for first, *others in kinds.values():
+                if others and set(others) != {first}:
+                    tqdm.write(f"warning: {len(others)} more warnings like this: {first}", file=sys.stderr)
 
 
 def frames_with_bar(items: Sequence[Item]) -> Iterable[Item]:

@@ -12,9 +12,8 @@ import tyro
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import warnings_as_lines
 from ciassd_jax.cli.options import Columns, Dtype, ImageSize, Unset, read_columns
-from ciassd_jax.data.clouds import CloudFile, find_clouds
+from ciassd_jax.data.clouds import CloudFile, find_clouds, read_cloud
 from ciassd_jax.formats.kitti_camera import frustum_of
-from ciassd_jax.formats.points import read_points
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.results import FrameResult, write_result
@@ -24,11 +23,12 @@ from ciassd_jax.inference.results import FrameResult, write_result
 class Predict:
     """Detect objects in a cloud or a folder of clouds.
 
-    Writes OUT/NAME.json for every cloud, and KITTI's rows as OUT/NAME.txt if it has a calibration.
+    Writes OUT/NAME.json for every cloud. If it has a calibration, the cloud is cropped to the camera's view, and KITTI's
+    rows are written as OUT/NAME.txt.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """A .bin, .npy, .npz or .pcd file, or a folder of such files."""
+    """A .bin, .npy, .npz, .pcd or .ply file, or a folder of such files."""
     weights: Path
     """Weights file (.safetensors, or a released .pth), or the name of bundled weights."""
     out: Path
@@ -44,38 +44,48 @@ class Predict:
     """Lowest class probability of a candidate."""
 
     def run(self) -> int:
-        clouds = find_clouds(self.path, calib=self.calib, image_size=self.image_size)
-        weights = load_as(self.weights, self.preset)
-        config = override(weights.config, dtype=self.dtype, score_threshold=self.score_threshold)
+        clouds = find_clouds(
+            self.path, calib=self.calib, image_size=self.image_size, columns=read_columns(self.columns)
+        )
+        short = {"dtype": self.dtype, "detection.score_threshold": self.score_threshold}
+        weights = self.config_options.load(self.weights, short)
         check_folder(self.out)
-        detector = Detector(weights.variables, config)
+        detector = Detector(weights.variables, weights.config)
         if self.path.is_dir():
-            self._folder(detector, clouds)
+            with warnings_as_lines(self.path):
+                self._folder(detector, clouds)
         else:
-            result, written = self._cloud(detector, clouds[0])
+            with warnings_as_lines(self.path):
+                result, written, cropped = self._cloud(detector, clouds[0])
             print(f"{self.path}: {_table(result)}")
-            print(f"Wrote {' and '.join(map(str, written))}.")
+            print(f"{_cropped(cropped)}Wrote {' and '.join(map(str, written))}.")
         return 0
 
-    def _cloud(self, detector: Detector, cloud: CloudFile) -> tuple[FrameResult, list[Path]]:
-        with warnings_as_lines(cloud.cloud):
-            result = detector(read_points(cloud.cloud), frustum=frustum_of(cloud.camera))
-            return result, write_result(result, cloud.cloud.stem, self.out, cloud.camera)
+    def _cloud(self, detector: Detector, cloud: CloudFile) -> tuple[FrameResult, list[Path], int]:
+        """Detect, write, and return the number of points that the camera does not see."""
+        points, cropped = read_cloud(cloud, read_columns(self.columns))
+        result = detector(points, frustum=frustum_of(cloud.camera), source=cloud.cloud)
+        return result, write_result(result, cloud.cloud.stem, self.out, cloud.camera), cropped
 
     def _folder(self, detector: Detector, clouds: Sequence[CloudFile]) -> None:
         from tqdm.auto import tqdm
 
-        boxes, seconds = 0, 0.0
+        boxes, seconds, cropped = 0, 0.0, 0
         with tqdm(clouds, unit="frame") as bar:
             for cloud in bar:
-                result, _ = self._cloud(detector, cloud)
+                result, _, outside = self._cloud(detector, cloud)
                 best = f"best {result.scores.max():.2f}" if len(result) else "none"
                 bar.write(f"{cloud.cloud.name}: {len(result)} boxes, {best}, {result.seconds:.3f} s")
-                boxes, seconds = boxes + len(result), seconds + result.seconds
+                boxes, seconds, cropped = boxes + len(result), seconds + result.seconds, cropped + outside
         print(
-            f"{len(clouds)} frames, {boxes} boxes, {seconds / len(clouds):.3f} s per frame without reading and "
-            f"compilation; results are in {self.out}."
+            f"{_cropped(cropped)}{len(clouds)} frames, {boxes} boxes, {seconds / len(clouds):.3f} s per frame without "
+            f"reading and compilation; results are in {self.out}."
         )
+
+
+def _cropped(number: int) -> str:
+    """A sentence on the points that were left out, or nothing."""
+    return f"Left out {number} points that the camera does not see, as in evaluation. " if number else ""
 
 
 def _table(result: FrameResult) -> str:

@@ -8,17 +8,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
 from ciassd_jax.cli.options import SIMULATED, Columns, ImageSize, Unset, open_simulated, read_columns
-from ciassd_jax.formats.errors import FormatWarning, InputError
+from ciassd_jax.formats.errors import FormatWarning, InputError, warn_of_file
 from ciassd_jax.formats.kitti_camera import frustum_of
+from ciassd_jax.formats.points import check_intensity
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.view.html import view_html
-from ciassd_jax.view.sources import Source, add_saved, dataset_sources, find_sources, read_source
+from ciassd_jax.view.sources import Source, add_saved, dataset_sources, detector_points, find_sources, read_source
 from ciassd_jax.view.view_frame import ViewFrame
 from ciassd_jax.view.viz_extra import require
 
@@ -81,15 +83,18 @@ class View:
         if self.image and not any(source.image for source in sources.values()):
             raise UsageError(f"{self.path} has no images; leave out --image.")
         weights = self.config_options.load(self.weights) if self.weights else None
+        config = weights.config if weights else self.config_options.resolve()
         frames = [read_source(sources[name], image=self.image) for name in frames_with_bar(list(sources))]
         if weights is not None:
-            detector = Detector(weights.variables, weights.config)
+            detector = Detector(weights.variables, config)
             return [_detect(detector, frame) for frame in frames_with_bar(frames)]
+        for frame in frames:
+            _check_intensity(frame, config.input.intensity_scale)
         return frames if self.results is None else _add_saved(frames, self.results)
 
     def _sources(self) -> dict[str, Source]:
         if self.path != SIMULATED:
-            return find_sources(Path(self.path), self.split, self.image_size)
+            return find_sources(Path(self.path), self.split, self.image_size, read_columns(self.columns))
         return dataset_sources(open_simulated(self.split, self.frames, self.seed))
 
     def _choose(self, sources: dict[str, Source]) -> dict[str, Source]:
@@ -108,7 +113,14 @@ class View:
 def _detect(detector: Detector, frame: ViewFrame) -> ViewFrame:
     """The frame with its detections; with a camera only those that it sees."""
     with warnings_as_lines(frame.name):
-        return detector(frame.points, frustum=frustum_of(frame.camera)).show_in(frame)
+        return detector(detector_points(frame), frustum=frustum_of(frame.camera), source=frame.name).show_in(frame)
+
+
+def _check_intensity(frame: ViewFrame, scale: float) -> None:
+    """Refuse a cloud that a detector would refuse too."""
+    _, clipped = check_intensity(np.asarray(frame.points, np.float32), scale, frame.name)
+    if clipped:
+        warn_of_file(f"{frame.name}: {clipped} intensities lie outside [0, {scale:g}].", frame.name)
 
 
 def _add_saved(frames: Sequence[ViewFrame], folder: Path) -> list[ViewFrame]:
