@@ -93,11 +93,10 @@ def decompress_lzf(data: bytes, size: int) -> bytes:
 def _decompress(body: bytes, size: int, path: Pathlike) -> bytes:
     """Decompress the points, which are preceded by their sizes as two uint32."""
     packed, unpacked = np.frombuffer(body[:8].ljust(8, b"\0"), "<u4").tolist()
-    if unpacked != size or len(body) < 8 + packed:
-        raise InputError(
-            f"{path} announces {size} bytes but holds {unpacked}, compressed to {packed} of which {len(body)} are "
-            "there; copy or save it again."
-        )
+    if len(body) < 8 + packed:
+        raise InputError(f"{path} is cut short; copy or save it again.")
+    if unpacked != size:
+        raise InputError(f"{path} announces {size} bytes but holds {unpacked}; copy or save it again.")
     try:
         return decompress_lzf(body[8 : 8 + packed], size)
     except ValueError as error:

@@ -1,6 +1,5 @@
 """Point files: what is read, and the one sentence that every unusable file gets."""
 
-import io
 import re
 import struct
 
@@ -8,36 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from point_samples import FACES, GOOD, LITTLE, POINTS, ascii_rows, compressed, pcd, ply, saved, structured
 
 from ciassd_jax.formats.errors import InputError
-from ciassd_jax.formats.points import POINT_SUFFIXES, read_points, write_bin
-
-POINTS = np.array([[1.5, -2.0, 0.25, 0.5], [70.0, 39.5, -3.0, 1.0], [0.0, 1e-3, -0.1, 0.0]], np.float32)
-
-
-def pcd(body: bytes, *, fields="x y z intensity", size="4 4 4 4", kind="F F F F", storage="ascii", **entries):
-    header = {
-        "VERSION": ".7",
-        "FIELDS": fields,
-        "SIZE": size,
-        "TYPE": kind,
-        "WIDTH": 3,
-        "HEIGHT": 1,
-        "POINTS": 3,
-    }
-    header |= {**entries, "DATA": storage}
-    lines = [f"{key} {value}" for key, value in header.items() if value is not None]
-    return "\n".join(["# .PCD v.7 - Point Cloud Data file format", *lines, ""]).encode() + body
-
-
-def ascii_rows(array: np.ndarray) -> bytes:
-    return "\n".join(" ".join(map(repr, row)) for row in array.tolist()).encode() + b"\n"
-
-
-def saved(write, *arrays, **named) -> bytes:
-    stream = io.BytesIO()
-    write(stream, *arrays, **named)
-    return stream.getvalue()
+from ciassd_jax.formats.points import POINT_SUFFIXES, parse_columns, read_points, write_bin
 
 
 def binary_mixed() -> bytes:
@@ -51,22 +24,6 @@ def binary_mixed() -> bytes:
         COUNT="1 1 1 1 3 1",
         storage="binary",
     )
-
-
-GOOD = {
-    "a.bin": POINTS.astype("<f4").tobytes(),
-    "A.BIN": POINTS.astype("<f4").tobytes(),
-    "a.npy": saved(np.save, POINTS),
-    "wide.npy": saved(np.save, np.pad(POINTS.astype(np.float64), ((0, 0), (0, 2)))),
-    "fortran.npy": saved(np.save, np.asfortranarray(POINTS)),
-    "one.npz": saved(np.savez, POINTS),
-    "named.npz": saved(np.savez_compressed, other=np.zeros(3), points=POINTS),
-    "ascii.pcd": pcd(ascii_rows(POINTS)),
-    "order.pcd": pcd(ascii_rows(POINTS[:, [3, 2, 1, 0]]), fields="reflectance z y x"),
-    "old.pcd": pcd(ascii_rows(POINTS), POINTS=None),
-    "binary.pcd": pcd(POINTS.astype("<f4").tobytes(), storage="binary"),
-    "newline.pcd": pcd(POINTS.astype("<f4").tobytes() + b"\n", storage="binary"),
-}
 
 
 @pytest.mark.parametrize("name", GOOD)
@@ -84,19 +41,82 @@ def test_binary_pcd_of_mixed_types_and_repeated_fields(tmp_path):
     np.testing.assert_allclose(read_points(tmp_path / "a.pcd"), POINTS * [1, 1, 1, 255], atol=0.5)
 
 
-def test_bin_round_trip_and_other_widths(tmp_path):
+@pytest.mark.parametrize("storage", ["binary", "binary_compressed"])
+def test_fields_of_several_values_and_no_points(tmp_path, storage):
+    body = bytes(8) if storage == "binary_compressed" else b""
+    (tmp_path / "a.pcd").write_bytes(pcd(body, POINTS=0, COUNT="1 1 2 1", storage=storage))
+    assert read_points(tmp_path / "a.pcd").shape == (0, 4)
+
+
+def test_compressed_fields_stand_one_after_the_other(tmp_path):
+    doubles = POINTS.astype("<f8")
+    parts = [np.arange(6, dtype="<u2"), *doubles[:, :3].T, np.uint8([128, 255, 0])]
+    body = compressed(b"".join(part.tobytes() for part in parts))
+    names = {"fields": "ring x y z i", "size": "2 8 8 8 1", "kind": "U F F F U", "COUNT": "2 1 1 1 1"}
+    (tmp_path / "a.pcd").write_bytes(pcd(body, storage="binary_compressed", **names))
+    np.testing.assert_array_equal(read_points(tmp_path / "a.pcd"), np.c_[POINTS[:, :3], [128, 255, 0]])
+
+
+def test_bin_round_trip(tmp_path):
     write_bin(tmp_path / "a.bin", POINTS)
     np.testing.assert_array_equal(read_points(str(tmp_path / "a.bin")), POINTS)
-    (tmp_path / "five.bin").write_bytes(np.pad(POINTS, ((0, 0), (0, 1))).tobytes())
-    np.testing.assert_array_equal(read_points(tmp_path / "five.bin", columns=5), POINTS)
-    with pytest.raises(InputError, match="2 does not give x, y and z"):
-        read_points(tmp_path / "a.bin", columns=2)
+
+
+@pytest.mark.parametrize(
+    ("columns", "order"),
+    [
+        (6, [0, 1, 2, 3, 4, 5]),
+        (("x", "y", "z", "intensity", "ring", "time"), [0, 1, 2, 3, 4, 5]),
+        (("Ring", "Z", "Reflectivity", "time", "X", "Y"), [4, 2, 3, 5, 0, 1]),
+        (("t", "i", "x", "ring", "y", "z"), [5, 3, 0, 4, 1, 2]),
+    ],
+)
+def test_columns_by_number_and_by_name(tmp_path, columns, order):
+    array = np.c_[POINTS, [7, 8, 9], [0.1, 0.2, 0.3]].astype("<f4")[:, order]
+    (tmp_path / "a.bin").write_bytes(array.tobytes())
+    np.save(tmp_path / "a.npy", array)
+    for name in ("a.bin", "a.npy"):
+        np.testing.assert_array_equal(read_points(tmp_path / name, columns), POINTS)
+
+
+def test_columns_are_parsed():
+    assert parse_columns(" 5") == 5
+    assert parse_columns("x, y,z,intensity") == ("x", "y", "z", "intensity")
+
+
+@pytest.mark.parametrize("columns", [2, -1, (), ("x", "y", "i"), ("x", "x", "y", "z"), ("five",)])
+def test_columns_need_x_y_and_z(tmp_path, columns):
+    write_bin(tmp_path / "a.bin", POINTS)
+    with pytest.raises(InputError, match=r"does not give x, y and z one column each; pass .* as `columns`\."):
+        read_points(tmp_path / "a.bin", columns)
+
+
+def test_columns_of_an_array_are_its_own(tmp_path):
+    np.save(tmp_path / "a.npy", POINTS)
+    with pytest.raises(InputError, match="has 4 columns, not 5; pass 4, or as many names, as `columns`"):
+        read_points(tmp_path / "a.npy", 5)
+    np.testing.assert_array_equal(read_points(tmp_path / "a.npy", 4), POINTS)
+
+
+@pytest.mark.filterwarnings("ignore:.*has no intensity")
+@pytest.mark.parametrize("rows", [3, 4, 5])
+@pytest.mark.parametrize("count", [13, 500])
+def test_an_array_of_columns_is_to_be_transposed(tmp_path, rows, count):
+    np.save(tmp_path / "a.npy", np.ones((rows, count)))
+    for columns in (None, 4):
+        with pytest.raises(InputError, match=rf"of shape \({rows}, {count}\); transpose it to \({count}, {rows}\)"):
+            read_points(tmp_path / "a.npy", columns)
+    assert read_points(tmp_path / "a.npy", count).shape == (rows, 4)
+    np.save(tmp_path / "a.npy", np.ones((count, rows)))
+    assert len(read_points(tmp_path / "a.npy", rows)) == count
 
 
 @pytest.mark.parametrize(
     ("name", "data"),
     [
         ("a.npy", saved(np.save, POINTS[:, :3])),
+        ("b.npy", saved(np.save, structured(POINTS[:, :3], "x y z"))),
+        ("a.ply", ply(ascii_rows(POINTS[:, :3]), properties="float x,float y,float z")),
         ("a.pcd", pcd(ascii_rows(POINTS[:, :3]), fields="x y z", size="4 4 4", kind="F F F")),
     ],
 )
@@ -110,9 +130,15 @@ def test_points_without_intensity_get_zero_and_a_warning(tmp_path, name, data):
 def test_no_points_are_points_where_a_header_says_so(tmp_path):
     (tmp_path / "a.npy").write_bytes(saved(np.save, POINTS[:0]))
     (tmp_path / "a.pcd").write_bytes(pcd(b"", POINTS=0))
-    (tmp_path / "b.pcd").write_bytes(pcd(b"", POINTS=0, storage="binary"))
-    for name in ("a.npy", "a.pcd", "b.pcd"):
+    (tmp_path / "a.ply").write_bytes(ply(b"").replace(b"vertex 3", b"vertex 0"))
+    for name in ("a.npy", "a.pcd", "a.ply"):
         assert read_points(tmp_path / name).shape == (0, 4)
+
+
+def test_a_file_without_intensity_lists_what_it_has(tmp_path):
+    (tmp_path / "a.pcd").write_bytes(pcd(ascii_rows(POINTS), fields="x y z Signal"))
+    with pytest.warns(UserWarning, match="no intensity among its columns x, y, z, Signal; 0 is used"):
+        read_points(tmp_path / "a.pcd")
 
 
 def test_values_are_not_cleaned(tmp_path):
@@ -175,10 +201,37 @@ BAD = {
         GOOD["binary.pcd"][:-1],
         "announces 3 points of 16 bytes but holds 47 bytes; copy or save it again",
     ),
-    "packed.pcd": (
-        pcd(b"", storage="zip"),
-        "stores its points as 'zip'; save it as ascii, binary or binary_compressed",
+    "zip.pcd": (pcd(b"", storage="zip"), "stores its points as 'zip'; save it as ascii, binary or binary_compressed"),
+    "sizes.pcd": (
+        pcd(compressed(bytes(44)), storage="binary_compressed"),
+        "announces 48 bytes but holds 44; copy or save it again",
     ),
+    "cut_packed.pcd": (GOOD["packed.pcd"][:-1], "is cut short; copy or save it again"),
+    "outside.pcd": (
+        pcd(struct.pack("<II", 2, 48) + b"\x20\x00", storage="binary_compressed"),
+        "is damaged: the compressed data points outside itself; copy",
+    ),
+    "bomb.pcd": (
+        pcd(struct.pack("<II", 1000, 48) + b"\0a" + b"\xe0\xff\0" * 332 + b"\0\0", storage="binary_compressed"),
+        "is damaged: the compressed data does not give 48 bytes; copy",
+    ),
+    "garbage.ply": (b"\0\1 nothing", "malformed PLY header .it does not begin with 'ply'.; save it again as"),
+    "endless.ply": (b"ply\nformat ascii 1.0\n", "it has no end_header"),
+    "unnamed.ply": (ply(b"").replace(b"format", b"comment"), "it has no format"),
+    "format.ply": (ply(b"", storage="zip"), r"malformed PLY header \(format zip 1.0\)"),
+    "type.ply": (ply(b"", properties="half x"), r"malformed PLY header \('half'\)"),
+    "property.ply": (b"ply\nproperty int x\n", "malformed PLY header"),
+    "number.ply": (ply(b"").replace(b"vertex 3", b"vertex many"), "malformed PLY header"),
+    "negative.ply": (ply(b"").replace(b"vertex 3", b"vertex -3"), r"\(element vertex -3\)"),
+    "points.ply": (ply(b"").replace(b"vertex", b"point"), "has no element 'vertex'; save its points again as vertices"),
+    "list.ply": (ply(b"", properties="float x,list uchar int y"), "has a list in or before its vertices; save its"),
+    "faces.ply": (ply(b"", before=FACES), "has a list in or before its vertices"),
+    "cut.ply": (ply(LITTLE[:-1], storage="binary_little_endian"), "announces 3 vertices but holds 2; copy or save"),
+    "more.ply": (ply(ascii_rows(POINTS) * 2), "announces 3 vertices but holds 6"),
+    "word.ply": (ply(b"1 2 3 four\n" * 3), "has a vertex that is not made of numbers; save it again"),
+    "bare.ply": (ply(b"", properties=""), "announces 3 vertices but holds 0"),
+    "flat.ply": (ply(bytes(24), properties="float x,float y", storage="binary_big_endian"), "but not z; save it again"),
+    "nothing.npy": (saved(np.save, np.zeros(3, [("a", "U3")])), "save numbers of shape"),
 }
 
 
