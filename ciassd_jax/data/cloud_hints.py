@@ -30,7 +30,9 @@ def describe_cloud(
         return []
     coordinates = points[:: -(-len(points) // _SAMPLE), :3]
     hints = []
-    inside = ((coordinates >= np.float32(minimum)) & (coordinates < np.float32(maximum))).all(1).mean()
+    inside = (
+        ((coordinates >= np.array(minimum, np.float32)) & (coordinates < np.array(maximum, np.float32))).all(1).mean()
+    )
     if inside < _MIN_IN_RANGE:
         extent = ", ".join(
             f"{axis} {low:g} to {high:g}" for axis, low, high in zip("xyz", minimum, maximum, strict=True)

@@ -18,7 +18,7 @@ class _Field(NamedTuple):
 
     name: str
     dtype: np.dtype
-    count: int
+    width: int
     offset: int
     column: int
 
@@ -53,7 +53,7 @@ def read_pcd(data: bytes, path: Pathlike) -> list[tuple[str, np.ndarray]]:
     elif header.storage == "binary_compressed":
         body = _decompress(body, header.rows * header.stride, path)
         # Here the values of one field stand together.
-        places = [(field.offset * header.rows, field.dtype.itemsize * field.count) for field in header.fields]
+        places = [(field.offset * header.rows, field.dtype.itemsize * field.width) for field in header.fields]
     else:
         raise InputError(
             f"{path} stores its points as '{header.storage}'; save it as ascii, binary or binary_compressed."

@@ -97,18 +97,6 @@ def check_intensity(
     return points, int(clipped.sum())
 
 
-def scale_intensity(points: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, "N 4"], float | None]:
-    """Return points with intensity in [0, 1], and its largest value before if it had to be scaled, else None.
-
-    Intensities are divided by 255 if they exceed 2.
-    """
-    intensity = points[:, 3]
-    top = float(intensity.max(initial=0, where=np.isfinite(intensity)))
-    if top <= 2:
-        return points, None
-    return np.concatenate([points[:, :3], points[:, 3:] / np.float32(255)], 1), top
-
-
 def _intensity_fault(intensity: Float32[np.ndarray, " N"], scale: float) -> str:
     """Say how finite intensities lie outside [0, scale], and the remedy."""
     fault = f"outside [0, {scale:g}], from {intensity.min():g} to {intensity.max():g}"
