@@ -18,6 +18,7 @@ from ciassd_jax.cli.config_options import Replaced, print_fields, take_fields
 from ciassd_jax.cli.convert import Convert
 from ciassd_jax.cli.data_check import Check
 from ciassd_jax.cli.data_prepare import Prepare
+from ciassd_jax.cli.data_suggest import Suggest
 from ciassd_jax.cli.data_synth import Synth
 from ciassd_jax.cli.demo import Demo
 from ciassd_jax.cli.eval import Evaluate
@@ -33,10 +34,11 @@ from ciassd_jax.formats.errors import InputError
 
 @dataclass(frozen=True)
 class Data:
-    """Check, prepare or simulate a data set."""
+    """Check, describe by a config, prepare or simulate a data set."""
 
     action: Annotated[
         Annotated[Check, tyro.conf.subcommand("check", prefix_name=False)]
+        | Annotated[Suggest, tyro.conf.subcommand("suggest", prefix_name=False)]
         | Annotated[Prepare, tyro.conf.subcommand("prepare", prefix_name=False)]
         | Annotated[Synth, tyro.conf.subcommand("synth", prefix_name=False)],
         tyro.conf.arg(name=""),

@@ -26,6 +26,7 @@ _OPTIONS = {
     "as `intensity_scale`": "with --intensity-scale",
     "as `z_shift`": "with --z-shift",
     "as `limits`": "with --overlap",
+    "as `classes`": "with --classes",
     "`overwrite`": "--overwrite",
     "`write_synthetic`": "`ciassd data synth`",
 }

@@ -1,0 +1,48 @@
+"""`ciassd data suggest`: a config for a data set."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ciassd_jax.cli.config_options import ConfigOptions
+from ciassd_jax.cli.messages import describe, frames_with_bar, warnings_as_lines
+from ciassd_jax.cli.options import Columns, ImageSize, Unset, read_columns
+from ciassd_jax.data.folders import find_root, open_dataset
+from ciassd_jax.evaluation.suggest import suggest_config
+from ciassd_jax.formats.writing import check_folder, write_text
+
+
+@dataclass(frozen=True)
+class Suggest:
+    """Print a config with classes, range and capacities for a data set as JSON; sentences on it go to stderr."""
+
+    root: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")] = None
+    """Folder in KITTI's or OpenPCDet's custom layout; by default the variable KITTI_ROOT."""
+    split: str = "train"
+    """The frames to learn from: train, val, trainval, all, or a file that lists them."""
+    classes: Unset[tuple[str, ...]] = None
+    """The types to learn. Default: all with at least 5 % of the objects."""
+    config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
+    image_size: ImageSize = None
+    columns: Columns = None
+    out: Unset[Path] = None
+    """Write the config to this file instead."""
+
+    def run(self) -> int:
+        root, base = find_root(self.root), self.config_options.resolve()
+        if self.out is not None:
+            check_folder(self.out.parent)
+        with warnings_as_lines(root):
+            dataset = open_dataset(root, self.split, self.image_size, read_columns(self.columns))
+            config, notes = suggest_config(dataset, base, classes=self.classes, track=frames_with_bar)
+        print(*map(describe, notes), sep="\n", file=sys.stderr)
+        if self.out is None:
+            print(config.to_json())
+        else:
+            write_text(self.out, config.to_json())
+        return 0
