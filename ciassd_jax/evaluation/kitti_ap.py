@@ -106,9 +106,10 @@ def prepare(truths: Sequence[LabelledObjects], detections: Sequence[DetectedObje
     cameras = {bool(np.isfinite(objects.image_boxes).all()) for objects in (labels, found) if len(objects.frame)}
     if len(cameras) > 1:
         raise ValueError("only labels or only detections have image boxes; give both or neither.")
-    difficulty: Difficulty = "kitti"
     is_area = labels.types == DONT_CARE.lower()
-    if not is_area.all() and not has_image_box(labels)[~is_area].any():
+    # Data without a camera has its own difficulty.
+    difficulty: Difficulty = "points" if False in cameras else "kitti"
+    if difficulty == "kitti" and not is_area.all() and not has_image_box(labels)[~is_area].any():
         labels, difficulty = _grade_without_image(labels)
         found = without_image(found)
     areas = select(labels, is_area)
@@ -182,9 +183,6 @@ def possible_precision(num_truths: int) -> float:
 
 def _grade_without_image(labels: FlatObjects) -> tuple[FlatObjects, Difficulty]:
     """Return labels without image boxes, with a difficulty that needs none, and its kind."""
-    if np.isnan(labels.image_boxes).all():
-        # Data without a camera, which has its own difficulty.
-        return labels, "points"
     labels = without_image(labels)
     if (labels.points >= 0).all():
         return labels._replace(difficulty=difficulty_by_points(labels.points)), "points"

@@ -57,7 +57,7 @@ class Evaluation(NamedTuple):
 
     @property
     def has_camera(self) -> bool:
-        """Whether image boxes are evaluated and give KITTI's difficulty; true if there are no labels."""
+        """Whether image boxes are evaluated and give KITTI's difficulty; true if there are no objects."""
         return self.difficulty == "kitti"
 
     def precision(self, name: str, metric: Metric, limit: float, recall: Recall = "R40") -> list[float] | None:

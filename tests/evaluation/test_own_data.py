@@ -174,3 +174,11 @@ def test_areas_are_no_labels() -> None:
     frames = [([label(bbox=NO_BOX), label(3, "DontCare")], [found(label(), 1.0)])]
     assert not evaluate(*records(frames)).has_camera
     assert evaluate(*records([([label(3, "DontCare", bbox=NO_BOX)], [found(label(), 1.0)])])).has_camera
+
+
+def test_data_without_a_camera_and_without_labels() -> None:
+    truths, detections = records([([], [found(label(), 1.0)])])
+    bare = [frame._replace(image_boxes=None, alpha=None) for frame in detections]
+    evaluation = evaluate([frame._replace(image_boxes=None, alpha=None) for frame in truths], bare)
+    assert not evaluation.has_camera
+    assert "too low, they do not count" not in format_tables(evaluation)
