@@ -41,15 +41,15 @@ class Prepare:
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 
     def run(self) -> int:
-        root = find_root(self.root)
+        root, columns = find_root(self.root), read_columns(self.columns)
         path = database_path(self.out or root, self.split)
         check_folder(path.parent)
         with warnings_as_lines(root):
             if self.reduce:
                 if is_custom(root):
                     raise UsageError(f"{root} has no camera to crop clouds to; leave out --reduce.")
-                print(f"Wrote {write_reduced(root, self.image_size, frames_with_bar)} cropped clouds.")
-            dataset = open_dataset(root, self.split, self.image_size, read_columns(self.columns))
+                print(f"Wrote {write_reduced(root, self.image_size, frames_with_bar, columns)} cropped clouds.")
+            dataset = open_dataset(root, self.split, self.image_size, columns)
             build_database(dataset, path, frames_with_bar)
         print(f"Wrote the objects of {len(dataset)} frames to {path}.")
         print(_describe_classes(open_database(path, dataset), self.config_options.resolve()))

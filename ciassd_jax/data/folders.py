@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ciassd_jax.data.custom import PLACES as CUSTOM_PLACES
@@ -32,8 +33,11 @@ def open_dataset(
     """
     folder = find_root(root)
     if is_custom(folder):
-        return open_custom(folder, split, columns, need_labels=need_labels)
-    return open_kitti(folder, split, image_size, columns, need_labels=need_labels)
+        dataset = open_custom(folder, split, columns, need_labels=need_labels)
+    else:
+        dataset = open_kitti(folder, split, image_size, columns, need_labels=need_labels)
+    options = [f"{name} {value}" for name, value in (("image_size", image_size), ("columns", columns)) if value]
+    return replace(dataset, options=", ".join(options))
 
 
 def find_root(root: Pathlike | None) -> Path:

@@ -47,12 +47,14 @@ class Frame(NamedTuple):
 class Dataset:
     """The frames of one split by name; `read_frame` reads one of them. Worker processes can pickle it.
 
-    `find_files` returns the files that a frame is read from; None for frames that do not come from files.
+    `find_files` returns the files that a frame is read from; None for frames that do not come from files. `options` are
+    those of reading that change the frames, as text.
     """
 
     names: tuple[str, ...]
     read_frame: Callable[[str], Frame]
     find_files: Callable[[str], tuple[Path, ...]] | None = None
+    options: str = ""
 
     def __len__(self) -> int:
         return len(self.names)

@@ -109,9 +109,9 @@ def build_database(dataset: Dataset, path: Pathlike, track: Callable[[range], It
 def fingerprint_of(dataset: Dataset) -> str:
     """Return a hash of what a database is made of: names of frames, text of labels and calibration, sizes of clouds.
 
-    Frames that do not come from files are read.
+    The options of reading count too. Frames that do not come from files are read.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(dataset.options.encode())
     for index, name in enumerate(dataset.names):
         digest.update(f"{name}\n".encode())
         for path in dataset.sources(index):

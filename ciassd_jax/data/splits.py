@@ -71,7 +71,7 @@ def split_names(root: Path, split: str, folder: Path, places: Places) -> tuple[s
         complete = sum(all(find_file(folder, paths, name) for paths in places.values()) for name in names)
         empty = " (empty files for frames without objects)" if kind == "label" else ""
         place = "a file and give its path as the split" if split == ALL else split_file(root, split)
-        others = f", or list only the {complete} complete frames in {place}" if complete else ""
+        others = f", or list only the complete frames ({complete} of {len(names)}) in {place}" if complete else ""
         raise InputError(f"{source}: {clause}; copy them{empty}{others}.")
     return names
 

@@ -4,9 +4,13 @@ import hashlib
 from pathlib import Path
 
 import pytest
-from mini_folders import write_custom, write_kitti, write_split
+from mini_folders import NAMES, write_custom, write_kitti, write_split
+from small import IMAGE_SIZE
 
+from ciassd_jax.data.clouds import find_clouds
 from ciassd_jax.data.folders import open_dataset
+from ciassd_jax.data.gt_sampling import database_path
+from ciassd_jax.data.kitti import write_reduced
 from ciassd_jax.data.splits import official_split
 from ciassd_jax.formats.errors import InputError
 
@@ -61,7 +65,7 @@ def test_a_split_file_wins_over_the_official_list(tmp_path: Path) -> None:
             "mine",
             ("000001", "000002", "000003"),
             r"mine\.txt: 2 of 3 frames have no cloud \S+velodyne_reduced/NAME\.bin or \S+velodyne/NAME\.bin "
-            r"\(000002, 000003\); copy them, or list only the 1 complete frames in \S+mine\.txt\.",
+            r"\(000002, 000003\); copy them, or list only the complete frames \(1 of 3\) in \S+mine\.txt\.",
         ),
         (
             "val",
@@ -105,3 +109,53 @@ def test_a_folder_of_neither_layout(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         open_dataset(None, "train")
     monkeypatch.setenv("KITTI_ROOT", str(write_kitti(tmp_path)))
     assert len(open_dataset(None, "all")) == 3
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_lists_are_read_as_windows_writes_them(tmp_path: Path, encoding: str) -> None:
+    root = write_custom(tmp_path, names=("a", "scan 7", "12.5"))
+    (root / "ImageSets/train.txt").write_bytes("\r\n12.5\r\n\r\n  scan 7 \r\na.npy\r\n\r\n".encode(encoding))
+    assert open_dataset(root, "train").names == ("12.5", "scan 7", "a")
+
+
+def test_a_split_may_be_the_path_of_a_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write_kitti(tmp_path / "kitti")
+    (tmp_path / "few.txt").write_text("000001\n")
+    assert open_dataset(root, str(tmp_path / "few.txt")).names == ("000001",)
+    monkeypatch.chdir(tmp_path)
+    assert open_dataset(root, "few.txt").names == ("000001",)
+    assert database_path(root, str(tmp_path / "few.txt")) == root / "objects_few.bin"
+    assert database_path(root, "v1.0") == root / "objects_v1.0.bin"
+    with pytest.raises(InputError, match=r"^none/few\.txt does not exist; write it, one frame per line, or choose"):
+        open_dataset(root, "none/few.txt")
+
+
+@pytest.mark.parametrize("content", [b"\xff" * 200, b"../../etc/passwd\n", b"a\0b\n", b"x" * 300, b".hidden\n"])
+def test_a_list_of_other_things_than_names_gets_one_sentence(tmp_path: Path, content: bytes) -> None:
+    root = write_custom(tmp_path)
+    (root / "ImageSets/train.txt").write_bytes(content)
+    with pytest.raises(InputError, match=r"train\.txt: .* does not name a frame; write the names of the frames' files"):
+        open_dataset(root, "train")
+
+
+def test_names_that_start_with_a_dot_are_no_data(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path / "kitti")
+    for path in list((root / "training").rglob("000000.*")):
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert open_dataset(root, "all").names == NAMES
+    assert [file.cloud.stem for file in find_clouds(root / "training/velodyne", image_size=IMAGE_SIZE)] == list(NAMES)
+    assert write_reduced(root, None) == len(NAMES)
+
+
+def test_frames_without_labels_open_only_where_none_are_needed(tmp_path: Path) -> None:
+    own, kitti = write_custom(tmp_path / "own"), write_kitti(tmp_path / "kitti")
+    (own / "labels/a.txt").unlink()
+    (kitti / "training/label_2/000001.txt").unlink()
+    for root, lacking in ((own, 0), (kitti, 1)):
+        with pytest.raises(InputError, match="frames have no label"):
+            open_dataset(root, "all")
+        dataset = open_dataset(root, "all", need_labels=False)
+        labelled = [dataset.read(index).rows is not None for index in range(len(dataset))]
+        assert [index for index, has in enumerate(labelled) if not has] == [lacking]
+        assert dataset.read(lacking).names == ()
+        assert len(dataset.read(lacking).points) > 0
