@@ -223,9 +223,7 @@ def sample_objects(
         slots = np.flatnonzero(objects.label == label).reshape(2, -1)[:, :wanted].ravel()
         drawn[slots[: len(chosen)]] = chosen
         objects.wanted[label] = wanted
-    _fill(objects, database, drawn)
-    # The loader refuses or counts such intensities of the same points in their own frames.
-    objects.points[:, 3].clip(0, config.input.intensity_scale, out=objects.points[:, 3])
+    _fill(objects, database, drawn, config.input.intensity_scale)
     return objects
 
 
@@ -237,7 +235,7 @@ def eligible_objects(database: ObjectDatabase, one: ClassConfig, *, difficulty_f
     return np.flatnonzero(fit & (objects["difficulty"] >= 0) if difficulty_filter else fit)
 
 
-def _fill(objects: SampledObjects, database: ObjectDatabase, drawn: Int[np.ndarray, " O"]) -> None:
+def _fill(objects: SampledObjects, database: ObjectDatabase, drawn: Int[np.ndarray, " O"], scale: float) -> None:
     """Write boxes and points of the drawn objects (-1: none) in place; an object whose points do not fit is cut."""
     filled = 0
     for slot in np.flatnonzero(drawn >= 0):
@@ -252,6 +250,8 @@ def _fill(objects: SampledObjects, database: ObjectDatabase, drawn: Int[np.ndarr
         rows = slice(filled, filled + len(points))
         objects.points[rows] = points
         objects.points[rows, :3] += center
+        # The loader refuses or counts such intensities in the frames that the points come from.
+        objects.points[rows, 3] = np.clip(points[:, 3], 0, scale)
         objects.owner[rows] = slot
         objects.valid[slot] = True
         filled = rows.stop

@@ -65,7 +65,8 @@ def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Ite
         # The loader reads the frames again and gives their warnings.
         with collected_warnings():
             frame = dataset.read(index)
-        inside = ((frame.boxes.center >= low) & (frame.boxes.center <= high)).all(-1)
+        center = np.asarray(frame.boxes.center)
+        inside = ((center >= low) & (center <= high)).all(-1)
         if (inside & (target_labels(frame, config) >= 0)).any():
             return
         found.update(frame.names)

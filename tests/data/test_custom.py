@@ -9,6 +9,7 @@ from mini_folders import OBJECTS, full_cloud, object_boxes, write_custom
 
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import difficulty_by_points
+from ciassd_jax.data.gt_sampling import build_database, open_database
 from ciassd_jax.formats.custom_rows import read_custom_rows
 from ciassd_jax.formats.errors import FormatWarning, InputError
 
@@ -39,6 +40,50 @@ def test_points_that_are_not_finite_are_left_out_with_a_warning(tmp_path: Path) 
     with pytest.warns(FormatWarning, match=rf"a\.npy: 3 of {len(points)} points are not finite; they were left out\."):
         frame = open_dataset(root, "train").read(0)
     np.testing.assert_array_equal(frame.points, points[3:])
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".npz", ".NPY", ".pcd"])
+def test_clouds_have_any_suffix(tmp_path: Path, suffix: str) -> None:
+    root = write_custom(tmp_path)
+    (root / "points/a.npy").unlink()
+    path, points = root / f"points/a{suffix}", full_cloud(0)
+    if suffix == ".bin":
+        points.tofile(path)
+    elif suffix == ".npz":
+        np.savez(path, points=points)
+    elif suffix == ".NPY":
+        with open(path, "wb") as stream:
+            np.save(stream, points)
+    else:
+        header = "FIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA binary\n"
+        path.write_bytes(header.format(len(points)).encode() + points.tobytes())
+    dataset = open_dataset(root, "train")
+    np.testing.assert_array_equal(dataset.read(0).points, points)
+    assert [one.name for one in dataset.sources(0)] == [path.name, "a.txt"]
+
+
+def test_columns_are_those_of_all_clouds_and_of_the_database(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    for name in "ab":
+        points = full_cloud(0)
+        np.save(root / f"points/{name}.npy", np.insert(points, 3, 7, axis=1))
+    columns = ("x", "y", "z", "ring", "intensity")
+    dataset = open_dataset(root, "train", columns=columns)
+    np.testing.assert_array_equal(dataset.read(0).points, full_cloud(0))
+    build_database(dataset, tmp_path / "objects.bin")
+    assert open_database(tmp_path / "objects.bin", dataset).points[:, 3].max() <= 1
+    with pytest.raises(InputError, match="stale or of another split"):
+        open_database(tmp_path / "objects.bin", open_dataset(root, "train"))
+
+
+def test_a_problem_of_many_frames_is_told_once(tmp_path: Path) -> None:
+    root = write_custom(tmp_path, names=tuple("abc"))
+    for path in (root / "points").iterdir():
+        np.save(path, np.load(path)[:, :3])
+    message = rf"^{root}/points/a\.npy has no intensity .* Other frames with this problem: 2\.$"
+    with pytest.warns(FormatWarning, match=message) as caught:
+        build_database(open_dataset(root, "train"), tmp_path / "objects.bin")
+    assert len(caught) == 1
 
 
 def test_difficulty_is_by_points() -> None:

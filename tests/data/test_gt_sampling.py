@@ -250,6 +250,33 @@ def test_filters(database):
     assert len(eligible_objects(database, replace(car_class, name="Tram"), difficulty_filter=True)) == 0
 
 
+def test_case_does_not_matter(database, tmp_path):
+    def read(name: str) -> Frame:
+        frame = make_frame(name)
+        return frame._replace(names=("car", "CAR", "Van", "cyclist"))
+
+    dataset = replace(DATASET, read_frame=read)
+    build_database(dataset, tmp_path / "objects.bin")
+    other = open_database(tmp_path / "objects.bin", dataset)
+    assert set(other.names) == {"car", "CAR", "Van", "cyclist"}
+    for one in CONFIG.classes:
+        expected = eligible_objects(database, one, difficulty_filter=True)
+        np.testing.assert_array_equal(eligible_objects(other, one, difficulty_filter=True), expected)
+    numbers = {"seed": 1, "epoch": 0, "frame": 0, "config": CONFIG}
+    drawn = sample_objects(database, ["Car", "Car", "Van"], **numbers)
+    jax.tree.map(np.testing.assert_array_equal, drawn, sample_objects(other, ["CAR", "car", "VAN"], **numbers))
+    assert drawn.wanted.tolist() == [2, 2]
+
+
+def test_intensities_are_clipped_to_the_scale(database):
+    config = replace(CONFIG, input=replace(CONFIG.input, intensity_scale=0.5))
+    numbers = {"seed": 1, "epoch": 0, "frame": 0}
+    before = sample_objects(database, [], **numbers, config=CONFIG).points
+    after = sample_objects(database, [], **numbers, config=config).points
+    assert before[:, 3].max() > 0.5
+    np.testing.assert_array_equal(after, np.minimum(before, [np.inf, np.inf, np.inf, 0.5]).astype(np.float32))
+
+
 def test_enough_objects_or_no_sampling_draw_nothing(database):
     many = draw(database, ("Car",) * 5 + ("Cyclist",) * 2)
     off = replace(CONFIG, data=replace(CONFIG.data, augmentation=AugmentationConfig(gt_sampling=False)))

@@ -9,6 +9,7 @@ import pytest
 from mini_folders import NAMES, OBJECTS, full_cloud, object_boxes, object_points, png_header, write_kitti
 from small import CALIBRATION, IMAGE_SIZE
 
+from ciassd_jax.data.clouds import find_clouds, find_image, read_cloud
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.data.kitti import crop_to_view, read_seen_points, write_reduced
@@ -101,6 +102,49 @@ def test_the_image_size_is_given_or_the_png_s_or_the_usual(tmp_path: Path) -> No
         assert frame.camera is not None
         assert frame.camera.image_size == size
         np.testing.assert_array_equal(frame.points, full_cloud(0)[seen(full_cloud(0), frame.camera)])
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".JPG", ".jpeg"])
+def test_images_may_be_jpegs(tmp_path: Path, suffix: str) -> None:
+    image = pytest.importorskip("PIL.Image").fromarray(np.zeros((200, 320, 3), np.uint8))
+    root = write_kitti(tmp_path)
+    for path in (root / "training/image_2").iterdir():
+        path.unlink()
+        image.save(path.with_suffix(suffix), "JPEG")
+    camera = read_first(root).camera
+    assert camera is not None
+    assert camera.image_size == (320, 200)
+    cloud = root / "training/velodyne/000000.bin"
+    (file,) = find_clouds(cloud)
+    assert file.camera is not None
+    assert file.camera.image_size == (320, 200)
+    assert find_image(cloud) == root / f"training/image_2/000000{suffix}"
+
+
+def test_a_cloud_is_cropped_as_in_evaluation_unless_it_is_reduced(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    (file,) = find_clouds(root / "training/velodyne/000000.bin")
+    points, outside = read_cloud(file)
+    np.testing.assert_array_equal(points, read_first(root).points)
+    assert outside == len(full_cloud(0)) - len(points) > 0
+    assert read_cloud(file._replace(camera=None))[1] == 0
+    folder = root / "training/velodyne_reduced"
+    folder.mkdir()
+    write_bin(folder / "000000.bin", full_cloud(0))
+    (file,) = find_clouds(folder)
+    assert file.camera is not None
+    np.testing.assert_array_equal(read_cloud(file)[0], full_cloud(0))
+
+
+def test_own_types_and_areas_in_any_case(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    path = root / "training/label_2/000000.txt"
+    path.write_text(path.read_text().replace("DontCare", "dontcare").replace("Van", "Forklift"))
+    frame = read_first(root)
+    assert frame.names == ("Car", "Forklift", "Pedestrian")
+    assert [row.type for row in frame.objects] == ["Car", "Forklift", "Pedestrian"]
+    assert frame.rows is not None
+    assert len(frame.rows) == 4
 
 
 def test_a_missing_image_is_warned_of_once_where_clouds_are_cropped(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from ciassd_jax import Config, three_class, tiny
 from ciassd_jax.config import AugmentationConfig
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.data.scenes import pad_frame, target_labels
-from ciassd_jax.formats.errors import InputError
+from ciassd_jax.formats.errors import FormatWarning, InputError
 from ciassd_jax.types import Boxes
 
 TYPES = ("Van", "Car", "Truck", "Pedestrian", "Car")
@@ -66,6 +66,16 @@ def test_leaves_are_of_one_type_whatever_the_frame() -> None:
 def test_targets_are_the_classes_and_their_similar_ones(config: Config, labels: list[int]) -> None:
     assert target_labels(make_frame(), config).tolist() == labels
     assert pad_frame(make_frame(), 0, config).truth.label[:5].tolist() == labels
+
+
+def test_case_does_not_matter_but_is_told() -> None:
+    frame = make_frame(names=("VAN", "car", "Truck", "Car"))
+    with pytest.warns(FormatWarning) as caught:
+        scene = pad_frame(frame, 0, tiny())
+    assert scene.truth.label[:4].tolist() == [0, 0, -1, 0]
+    texts = [f"Labels of type {name} count as Car, because case does not matter." for name in ("VAN", "car")]
+    assert [str(one.message) for one in caught] == texts
+    assert target_labels(frame, with_augmentation(tiny(), similar_classes=False)).tolist() == [-1, 0, -1, 0]
 
 
 def test_a_name_is_its_own_class_before_it_is_similar_to_another() -> None:
