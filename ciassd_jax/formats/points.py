@@ -128,7 +128,7 @@ def _pick_columns(columns: NamedColumns, path: Pathlike) -> Float32[np.ndarray, 
     named: dict[str, np.ndarray] = {}
     for name, values in columns:
         named.setdefault(name.lower().removeprefix("scalar_"), values)
-    found = ", ".join(name for name, _ in columns)
+    found = _listed([name for name, _ in columns])
     if missing := [name for name in "xyz" if name not in named]:
         raise InputError(f"{path} has the columns {found} but not {', '.join(missing)}; save it again with x, y, z.")
     picked = [*"xyz", *[name for name in _INTENSITIES if name in named][:1]]
@@ -139,6 +139,11 @@ def _pick_columns(columns: NamedColumns, path: Pathlike) -> Float32[np.ndarray, 
         text = f"{path} has no intensity among its columns {found}; 0 is used instead."
         warn_of_file(text, path, stacklevel=5)
     return points
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names of a file on one line."""
+    return ", ".join(ascii(name)[1:-1] for name in names)
 
 
 def _read_bin(data: bytes, path: Pathlike, width: int, names: tuple[str, ...]) -> NamedColumns:
@@ -192,6 +197,6 @@ def _read_numpy(data: bytes, path: Pathlike, *, archive: bool) -> np.ndarray:
             f"write it again with np.{'savez' if archive else 'save'}."
         ) from error
     raise InputError(
-        f"{path} holds {len(names)} arrays ({', '.join(names)}) and none is named 'points'; "
+        f"{path} holds {len(names)} arrays ({_listed(names)}) and none is named 'points'; "
         "write it again with np.savez(path, points=points)."
     )
