@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from ciassd_jax.cli.messages import UsageError
-from ciassd_jax.data.splits import official_split
+from ciassd_jax.data.splits import official_split, present_paths
 from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes
 from ciassd_jax.formats.kitti_rows import parse_row
 from ciassd_jax.formats.lines import read_lines
@@ -52,7 +52,7 @@ def check_results(folder: Pathlike) -> list[str]:
     There must be one file for each of the 7518 test frames, and every line must have 16 columns, the score last.
     """
     expected = {f"{name}.txt" for name in official_split("test") or ()}
-    found = {path.name for path in Path(folder).glob("*.txt")}
+    found = {path.name for path in present_paths(Path(folder), ("{}.txt",))}
     problems = []
     if missing := expected - found:
         problems.append(
@@ -73,7 +73,7 @@ def write_submission(folder: Pathlike, archive: Pathlike) -> int:
     problems = check_results(folder)
     if problems:
         raise InputError(problems[0])
-    paths = sorted(Path(folder).glob("*.txt"))
+    paths = present_paths(Path(folder), ("{}.txt",))
     with replacing(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as stream:
         for path in paths:
             stream.writestr(zipfile.ZipInfo(path.name, _TIME), read_bytes(path), zipfile.ZIP_DEFLATED)

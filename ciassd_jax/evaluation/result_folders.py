@@ -55,7 +55,8 @@ def _text_files(folder: Pathlike, what: str) -> dict[str, Path]:
         state = "is a file" if path.exists() else "does not exist"
         raise InputError(f"{folder} {state}; name the folder that holds the {what} as NNNNNN.txt.")
     try:
-        files = {file.name: file for file in sorted(path.iterdir()) if file.suffix == ".txt"}
+        visible = sorted(file for file in path.iterdir() if not file.name.startswith("."))
+        files = {file.name: file for file in visible if file.suffix == ".txt"}
     except OSError as error:
         raise InputError(f"{folder} cannot be read ({error.strerror}); check its permissions.") from error
     if not files:
