@@ -40,8 +40,7 @@ def read_pcd(data: bytes, path: Pathlike) -> list[tuple[str, np.ndarray]]:
     """
     header, body = _read_header(data, path)
     if header.storage == "ascii":
-        rows = _read_ascii(body, header, path)
-        return [(field.name, rows[:, field.column]) for field in header.fields]
+        return _read_ascii(body, header, path)
     if header.storage == "binary":
         # A few bytes after the last point are allowed, because some writers end the file with a newline.
         if len(body) // header.stride != header.rows:
@@ -103,7 +102,8 @@ def _decompress(body: bytes, size: int, path: Pathlike) -> bytes:
         raise InputError(f"{path} is damaged: {error}; copy or save it again.") from error
 
 
-def _read_ascii(body: bytes, header: _Header, path: Pathlike) -> np.ndarray:
+def _read_ascii(body: bytes, header: _Header, path: Pathlike) -> list[tuple[str, np.ndarray]]:
+    """Read the fields as float64, or as bytes where the header says so."""
     try:
         values = np.array(body.split(), np.float64)
     except ValueError as error:
@@ -113,7 +113,12 @@ def _read_ascii(body: bytes, header: _Header, path: Pathlike) -> np.ndarray:
             f"{path} announces {header.rows} points of {header.columns} numbers "
             f"but holds {values.size} numbers; copy or save it again."
         )
-    return values.reshape(-1, header.columns)
+    fields = []
+    for field in header.fields:
+        column = values.reshape(-1, header.columns)[:, field.column]
+        is_byte = field.dtype == np.uint8 and ((column >= 0) & (column <= 255)).all()
+        fields.append((field.name, column.astype(np.uint8) if is_byte else column))
+    return fields
 
 
 def _read_header(data: bytes, path: Pathlike) -> tuple[_Header, bytes]:

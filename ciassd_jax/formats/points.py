@@ -44,7 +44,8 @@ def read_points(path: Pathlike, columns: int | Sequence[str] | None = None) -> F
     `columns` describes the points of files that do not name their columns: how many numbers a point has, of which the
     first are x, y, z, intensity, or the names of all. It defaults to 4 for `.bin` and to what an array has. Of named
     columns, x, y, z and the first of intensity, reflectivity, reflectance, i are read, in any case and with or
-    without CloudCompare's prefix `scalar_`. Without an intensity it is 0, with a FormatWarning.
+    without CloudCompare's prefix `scalar_`. An intensity that is stored as a byte is divided by 255, its largest value.
+    Without an intensity it is 0, with a FormatWarning.
 
     Raises InputError, one sentence with the remedy, for a file that is missing, empty or malformed, and for a `.bin`
     whose numbers make sense only with another number of columns.
@@ -82,13 +83,13 @@ def check_intensity(
     """Return the points with intensities clipped to [0, scale], and how many were clipped.
 
     Intensities that are not finite or beyond 1000 times the scale are left: voxelisation drops and counts such points.
-    Raises InputError if more than 1 % of the points have a finite intensity outside [0, scale].
+    Raises InputError if more than one point, and more than 1 % of them, have a finite intensity outside [0, scale].
     """
     intensity = points[:, 3]
     outside = ((intensity < 0) | (intensity > scale)) & np.isfinite(intensity)
     if not outside.any():
         return points, 0
-    if outside.mean() > 0.01:
+    if outside.sum() > max(1, 0.01 * len(points)):
         fault = _intensity_fault(intensity[np.isfinite(intensity)], scale)
         raise InputError(f"{source} has {100 * outside.mean():.3g} % of its intensities {fault}")
     clipped = outside & (np.abs(intensity) <= 1000 * scale)
@@ -135,6 +136,8 @@ def _pick_columns(columns: NamedColumns, path: Pathlike) -> Float32[np.ndarray, 
     points = np.zeros((len(named["x"]), 4), np.float32)
     for index, name in enumerate(picked):
         points[:, index] = named[name]
+    if len(picked) == 4 and named[picked[3]].dtype == np.uint8:
+        points[:, 3] /= 255
     if len(picked) == 3:
         text = f"{path} has no intensity among its columns {found}; 0 is used instead."
         warn_of_file(text, path, stacklevel=5)

@@ -38,7 +38,15 @@ def test_every_format_gives_the_same_points(tmp_path, name):
 
 def test_binary_pcd_of_mixed_types_and_repeated_fields(tmp_path):
     (tmp_path / "a.pcd").write_bytes(binary_mixed())
-    np.testing.assert_allclose(read_points(tmp_path / "a.pcd"), POINTS * [1, 1, 1, 255], atol=0.5)
+    np.testing.assert_allclose(read_points(tmp_path / "a.pcd"), POINTS, atol=0.5 / 255)
+
+
+@pytest.mark.parametrize(("type_of_intensity", "expected"), [("U 1", 0.4), ("F 4", 102), ("U 2", 102)])
+def test_an_intensity_that_is_a_byte_is_a_fraction_of_255(tmp_path, type_of_intensity, expected):
+    kind, size = type_of_intensity.split()
+    header = pcd(b"1 2 3 102\n", POINTS=1, size=f"4 4 4 {size}", kind=f"F F F {kind}", storage="ascii")
+    (tmp_path / "a.pcd").write_bytes(header)
+    np.testing.assert_allclose(read_points(tmp_path / "a.pcd")[0, 3], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("storage", ["binary", "binary_compressed"])
@@ -54,7 +62,7 @@ def test_compressed_fields_stand_one_after_the_other(tmp_path):
     body = compressed(b"".join(part.tobytes() for part in parts))
     names = {"fields": "ring x y z i", "size": "2 8 8 8 1", "kind": "U F F F U", "COUNT": "2 1 1 1 1"}
     (tmp_path / "a.pcd").write_bytes(pcd(body, storage="binary_compressed", **names))
-    np.testing.assert_array_equal(read_points(tmp_path / "a.pcd"), np.c_[POINTS[:, :3], [128, 255, 0]])
+    np.testing.assert_allclose(read_points(tmp_path / "a.pcd"), np.c_[POINTS[:, :3], np.array([128, 255, 0]) / 255])
 
 
 def test_bin_round_trip(tmp_path):
