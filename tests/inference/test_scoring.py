@@ -20,7 +20,7 @@ from ciassd_jax.data.frames import Dataset
 from ciassd_jax.evaluation import LIMITS, Evaluation, evaluate, read_folders, to_json
 from ciassd_jax.formats.errors import DroppedWarning, FormatWarning, InputError
 from ciassd_jax.formats.kitti_rows import parse_row
-from ciassd_jax.formats.points import read_points, write_bin
+from ciassd_jax.formats.points import write_bin
 from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.inference.scoring import detect_dataset, find_trained, score_dataset, score_frames, write_frames
 from ciassd_jax.simulation import Lidar, open_synthetic
@@ -209,18 +209,17 @@ def test_frames_without_labels_are_refused(tmp_path: Path) -> None:
 
 
 def test_problems_of_frames_are_reported_once(tmp_path: Path) -> None:
-    root = write_kitti(tmp_path)
-    for name in NAMES:
-        path = root / f"training/velodyne/{name}.bin"
-        points = read_points(path) * np.float32([1, 1, 1, 255])
-        points[0, 0] = np.nan if name == NAMES[1] else 0
-        write_bin(path, points)
+    root = write_custom(tmp_path, names=tuple("abc"))
+    for path in (root / "points").iterdir():
+        points = np.load(path)[:, :3]
+        points[0, 0] = np.nan if path.stem == "b" else 0
+        np.save(path, points)
     with pytest.warns(FormatWarning) as caught:
         detect_dataset(Oracle(all_objects), open_dataset(root, "all"))
     texts = [str(one.message) for one in caught]
     assert len(texts) == 2
-    assert re.search(r"000000\.bin has intensities of .* Other frames .*: 2\.$", texts[0])
-    assert re.search(r"000001\.bin: 1 of 980 points are not finite; they were left out\.$", texts[1])
+    assert re.search(r"a\.npy has no intensity .* Other frames with this problem: 2\.$", texts[0])
+    assert re.search(r"b\.npy: 1 of 980 points are not finite; they were left out\.$", texts[1])
 
 
 def test_other_warnings_are_left_alone(tmp_path: Path) -> None:
