@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import tyro
 
-from ciassd_jax.cli.messages import frames_with_bar
-from ciassd_jax.cli.options import ImageSize, Preset, Unset
-from ciassd_jax.config.presets import PRESETS
-from ciassd_jax.evaluation.dataset_check import Finding, LabelScore, Report, check_dataset
+from ciassd_jax.cli.config_options import ConfigOptions
+from ciassd_jax.cli.messages import describe, frames_with_bar
+from ciassd_jax.cli.options import Columns, ImageSize, Unset, read_columns
+from ciassd_jax.evaluation.class_check import LabelScore
+from ciassd_jax.evaluation.dataset_check import Report, check_dataset
+from ciassd_jax.evaluation.frame_check import Finding
 from ciassd_jax.evaluation.kitti_ap import CURVE_POINTS
 
 
@@ -24,21 +26,27 @@ class Check:
     root: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")] = None
     """Folder in KITTI's or OpenPCDet's custom layout; by default the variable KITTI_ROOT."""
     split: Unset[str] = None
-    """train, val, trainval, test or a file of ImageSets. Default: every frame and all split files."""
-    preset: Preset = "car"
-    """The grid, classes and capacities to check against."""
+    """train, val, trainval, test, or a file that lists frames. Default: every frame and all split files."""
+    config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     image_size: ImageSize = None
+    columns: Columns = None
     most: int = 10
     """Findings of one kind to list; the others are counted."""
 
     def run(self) -> int:
-        config = PRESETS[self.preset]()
-        report = check_dataset(self.root, self.split, config=config, image_size=self.image_size, track=frames_with_bar)
+        config = self.config_options.resolve()
+        report = check_dataset(
+            self.root,
+            self.split,
+            config=config,
+            image_size=self.image_size,
+            columns=read_columns(self.columns),
+            track=frames_with_bar,
+        )
         for part in (_listing(report.findings, self.most), _table(report), _score_table(report.scores)):
             print(*part, sep="\n", end="\n" if part else "")
-        serious = sum(finding.serious for finding in report.findings)
-        print(f"{serious} errors, {len(report.findings) - serious} findings that are worth a look.")
-        return 1 if serious else 0
+        print(f"Verdict: {describe(report.verdict)}")
+        return 1 if any(finding.serious for finding in report.findings) else 0
 
 
 def _listing(findings: Sequence[Finding], most: int) -> list[str]:
@@ -48,7 +56,7 @@ def _listing(findings: Sequence[Finding], most: int) -> list[str]:
         kinds: dict[str, list[str]] = {}
         for finding in findings:
             if finding.serious == serious:
-                kinds.setdefault(finding.kind, []).append(finding.text)
+                kinds.setdefault(finding.kind, []).append(describe(finding.text))
         for kind, texts in kinds.items():
             lines += [f"{word}: {text}" for text in texts[:most]]
             if len(texts) > most:
@@ -63,11 +71,14 @@ def _table(report: Report) -> list[str]:
         amounts = [getattr(frame, what) for frame in report.frames] or [0]
         least, median, most = np.quantile(amounts, (0, 0.5, 1), method="nearest").tolist()
         rows.append(f"{what:<12} {least:>9} {median:>8} {most:>8}")
-    rows.append("type             objects  out of range  without points  length   width  height  centre z (medians, m)")
+    rows.append(
+        "type             objects   out of range  without points  length   width  height  centre z (medians, m)"
+    )
     for name, row in report.types.items():
         length, width, height = row.size
+        outside = f"{row.out_of_range} ({row.out_of_range / row.objects:.0%})"
         rows.append(
-            f"{name:<15} {row.objects:>8} {row.out_of_range:>13} {row.without_points:>15}"
+            f"{name:<15} {row.objects:>8} {outside:>14} {row.without_points:>15}"
             f"  {length:>6.2f}  {width:>6.2f}  {height:>6.2f}  {row.center_z:>8.2f}"
         )
     return rows

@@ -25,7 +25,7 @@ class Suggest:
     """Folder in KITTI's or OpenPCDet's custom layout; by default the variable KITTI_ROOT."""
     split: str = "train"
     """The frames to learn from: train, val, trainval, all, or a file that lists them."""
-    classes: Unset[tuple[str, ...]] = None
+    classes: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TYPE [TYPE ...]", help_behavior_hint="")] = None
     """The types to learn. Default: all with at least 5 % of the objects."""
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     image_size: ImageSize = None

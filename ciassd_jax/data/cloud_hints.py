@@ -12,7 +12,7 @@ _MIN_POINTS = 100
 _SAMPLE = 20_000
 _MIN_IN_RANGE = 0.1
 # Heights of points this near are counted in bins of two steps; the fullest is the ground if it has this share.
-_NEAR, _STEP, _MIN_GROUND = 40.0, 0.2, 0.1
+_NEAR, _STEP, _MIN_GROUND = 40.0, 0.2, 0.2
 # Hills and curbs move the ground of KITTI's frames by up to 0.4 m.
 _MAX_GAP = 0.5
 

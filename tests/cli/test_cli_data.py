@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from mini_folders import NAMES, OBJECTS, object_points, write_custom, write_kitti, write_split
 
+from ciassd_jax import Config, three_class
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.gt_sampling import open_database
 from ciassd_jax.evaluation.dataset_check import check_dataset
@@ -20,9 +21,9 @@ def test_sound_data_pass_the_check(run: Any, tmp_path: Path) -> None:
     assert result.code == 0
     lines = result.out.splitlines()
     assert lines[0].split() == ["3", "frames", "least", "median", "most"]
-    assert lines[-1] == "0 errors, 0 findings that are worth a look."
+    assert lines[-1] == "Verdict: ready to train: 6 Car objects in range in 3 frames."
     assert lines[-2] == "By KITTI's rule fewer than 41 objects cannot score 100, however well they are found."
-    assert ["Car", "3", "0", "0", "3.90", "1.60", "1.50", "-1.00"] in [line.split() for line in lines]
+    assert ["Car", "3", "0", "(0%)", "0", "3.90", "1.60", "1.50", "-1.00"] in [line.split() for line in lines]
     # Three cars give three points of 41, the first of which R40 leaves out.
     assert ["Car", "3d", "5.00", "5.00", "5.00", "3,", "3,", "3"] in [line.split() for line in lines]
 
@@ -37,7 +38,7 @@ def test_what_must_be_mended_is_exit_code_1(run: Any, tmp_path: Path) -> None:
     first, second, *_, last = result.out.splitlines()
     assert first.startswith(f"error: {root}/ImageSets/train.txt: 1 of 2 frames have no cloud")
     assert second.startswith(f"error: {path}, line 5: 1 columns; a label has 15")
-    assert last == "2 errors, 0 findings that are worth a look."
+    assert last == f"Verdict: not ready: 2 errors; first: {first.removeprefix('error: ')}"
 
 
 def test_what_is_odd_is_listed_up_to_most(run: Any, tmp_path: Path) -> None:
@@ -49,7 +50,7 @@ def test_what_is_odd_is_listed_up_to_most(run: Any, tmp_path: Path) -> None:
     lines = result.out.splitlines()
     assert [line.split(":")[0] for line in lines[:3]] == ["odd"] * 3
     assert lines[2] == "odd: ... and 1 more of this kind (no point); --most lists more."
-    assert lines[-1] == "0 errors, 3 findings that are worth a look."
+    assert lines[-1] == "Verdict: ready to train: 6 Car objects in range in 3 frames; findings worth a look: 3."
 
 
 def test_custom_data_are_checked_without_a_camera(run: Any, tmp_path: Path) -> None:
@@ -66,6 +67,7 @@ def test_test_frames_have_no_scores(run: Any, tmp_path: Path) -> None:
     result = run("data", "check", root, "--split", "test", "--preset", "tiny")
     assert result.code == 0
     assert "Labels as detections" not in result.out
+    assert result.out.splitlines()[-1] == "Verdict: ready to predict: 3 frames, without labels."
 
 
 @pytest.mark.parametrize(
@@ -87,6 +89,45 @@ def test_bad_input_is_exit_code_2_and_one_sentence(run: Any, arguments: tuple[st
 def test_the_folder_comes_from_the_environment(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KITTI_ROOT", str(write_kitti(tmp_path)))
     assert run("data", "check", "--preset", "tiny").code == 0
+
+
+def write_vehicles(root: Path) -> Path:
+    """Labels of types that no preset learns."""
+    write_custom(root)
+    for path in (root / "labels").iterdir():
+        path.write_text(path.read_text().replace("Car", "Vehicle").replace("Van", "Truck"))
+    return root
+
+
+def test_the_remedy_for_an_unknown_class_is_true(run: Any, tmp_path: Path) -> None:
+    root, path = write_vehicles(tmp_path / "data"), tmp_path / "config.json"
+    refused = run("data", "check", root, "--preset", "tiny")
+    assert refused.code == 1
+    assert "write a config for them with `ciassd data suggest`." in refused.out.splitlines()[-1]
+    suggested = run("data", "suggest", root, "--preset", "tiny", "--classes", "vehicle")
+    assert suggested.code == 0
+    path.write_text(suggested.out)
+    assert Config.from_json(suggested.out).class_names == ("Vehicle",)
+    assert suggested.err.startswith("Class Vehicle: 2 objects, anchors of 3.9 x 1.6 x 1.5 m centred at z = -1 m.\n")
+    assert "Left out: Truck (2), Pedestrian (2); name a type with --classes to learn it" in suggested.err
+    accepted = run("data", "check", root, "--config", path)
+    assert accepted.code == 0
+    assert accepted.out.splitlines()[-1] == "Verdict: ready to train: 2 Vehicle objects in range in 2 frames."
+
+
+def test_suggest_writes_a_file(run: Any, tmp_path: Path) -> None:
+    root, path = write_vehicles(tmp_path / "data"), tmp_path / "new/config.json"
+    result = run("data", "suggest", root, "--preset", "tiny", "--classes", "Vehicle", "truck", "--out", path)
+    assert (result.code, result.out) == (0, "")
+    assert Config.from_json(path.read_text()).class_names == ("Vehicle", "Truck")
+
+
+def test_suggest_names_the_types_there_are(run: Any, tmp_path: Path) -> None:
+    result = run("data", "suggest", write_vehicles(tmp_path), "--classes", "Forklift")
+    assert (result.code, result.out) == (2, "")
+    assert result.err == (
+        "error: No object is of the type Forklift; choose from Vehicle (2), Truck (2), Pedestrian (2).\n"
+    )
 
 
 def test_prepare_writes_the_database(run: Any, tmp_path: Path) -> None:
@@ -187,7 +228,7 @@ def test_labels_that_cover_each_other_score_less_than_is_possible(run: Any, tmp_
 
 @pytest.mark.reference
 def test_real_labels_score_100_or_what_fewer_objects_can(shared: Path) -> None:
-    scores = check_dataset(shared / "kitti").scores
+    scores = check_dataset(shared / "kitti", config=three_class()).scores
     assert all(one.score == one.possible for one in scores)
     by_class = {one.name: (one.objects, one.score) for one in scores if one.metric == "3d"}
     assert by_class == {

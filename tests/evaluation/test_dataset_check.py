@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from mini_folders import NAMES, OBJECTS, full_cloud, object_points, write_custom, write_kitti, write_split
 
-from ciassd_jax import car, tiny
-from ciassd_jax.evaluation.dataset_check import Finding, Report, check_dataset
+from ciassd_jax import Config, car, tiny
+from ciassd_jax.config import ClassConfig, InputConfig
+from ciassd_jax.evaluation.dataset_check import Report, check_dataset
+from ciassd_jax.evaluation.frame_check import Finding
 from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.kitti_rows import read_rows, write_rows
 from ciassd_jax.formats.points import write_bin
@@ -92,8 +94,8 @@ LABEL, CALIB = r"label_2/000000\.txt, line", r"calib/000000\.txt"
         (edit("training/label_2/000000.txt", "Car 0.0000", "Car nan"), True, rf"{LABEL} 1: a value is not finite"),
         (
             edit("training/label_2/000000.txt", "Car 0.0000", "car 0.0000"),
-            True,
-            rf"{LABEL} 1: the type 'car' is none of KITTI's; write",
+            False,
+            rf"{LABEL} 1: the type car \(1 objects\) is learned as the class Car; results are written like the class",
         ),
         (edit("training/calib/000000.txt", "P2:", "P9:"), True, rf"{CALIB} has no line P2; use"),
         (edit_rows(rotation_y=90.0), True, rf"{LABEL} 1: the heading 90 is outside \[-pi, pi\]; wrap it, in radians"),
@@ -101,14 +103,22 @@ LABEL, CALIB = r"label_2/000000\.txt, line", r"calib/000000\.txt"
         (edit_rows(truncated=-1.0), True, rf"{LABEL} 1: truncation must lie in 0\.\.1 and occlusion"),
         (edit_rows(occluded=4), True, rf"{LABEL} 1: truncation must lie in 0\.\.1 and occlusion"),
         (edit_rows(score=0.5), False, rf"{LABEL} 1: a label has no score; remove"),
-        (edit_rows(location=(1, 1, 30)), False, rf"{LABEL} 1: no point lies inside this Car; check its box"),
+        (edit_rows(location=(-4, 1, 11)), False, rf"{LABEL} 1: no point lies inside this Car; check its box"),
         (
             edit_points(lambda points: points.__setitem__((3, 0), np.nan)),
             False,
             r"1 of 180 points are not finite; they were left out",
         ),
-        (edit_points(lambda points: points.__imul__(np.float32([1, 1, 1, 255]))), False, r"were divided by 255"),
-        (edit_points(lambda points: points.__isub__(np.float32([0, 0, 0, 0.5]))), False, r"not all in \[0, 1\]; scale"),
+        (
+            edit_points(lambda points: points.__imul__(np.float32([1, 1, 1, 255]))),
+            True,
+            r"000000\.bin has .* % of its intensities outside \[0, 1\].*; pass 255 as `intensity_scale`",
+        ),
+        (
+            edit_points(lambda points: points.__setitem__((3, 3), 4.0)),
+            False,
+            r"1 points in 1 of 3 frames, the first 000000, have an intensity outside \[0, 1\]; training clips it",
+        ),
     ],
 )
 def test_damage_is_found_with_file_and_remedy(tmp_path: Path, damage: Damage, serious: bool, message: str) -> None:
@@ -143,8 +153,7 @@ def test_files_that_are_missing_or_truncated(tmp_path: Path) -> None:
     cloud = root / "training/velodyne/000004.bin"
     cloud.write_bytes(cloud.read_bytes()[:-1])
     report = check_dataset(root, config=tiny())
-    assert [finding.serious for finding in report.findings] == [True] * 3
-    first, second, third = (finding.text for finding in report.findings)
+    first, second, third = (finding.text for finding in report.findings if finding.serious)
     assert "1 of 3 frames have no cloud" in first
     assert "(000000); copy them" in first
     assert "1 of 3 frames have no label" in second
@@ -166,7 +175,7 @@ def test_labels_of_another_calibration(tmp_path: Path) -> None:
 def test_boxes_that_mostly_hold_no_point(tmp_path: Path) -> None:
     root = write_custom(tmp_path)
     for path in (root / "labels").iterdir():
-        path.write_text("".join(f"{box[1]} {box[0]} -1 1 1 1 0 {kind}\n" for kind, box in OBJECTS.items()))
+        path.write_text("".join(f"{box[0]} {-box[1]} -1 .1 .1 .1 0 {kind}\n" for kind, box in OBJECTS.items()))
     serious = [finding for finding in check_dataset(root, config=tiny()).findings if finding.serious]
     assert [finding.text for finding in serious] == [
         "6 of 6 boxes hold no point; check that labels, calibration and clouds belong together, and the axes of the "
@@ -243,28 +252,142 @@ def test_one_swapped_among_many(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("z", "message"),
+    ("z", "serious", "message"),
     [
-        (-0.1, "the centres of type Car are typically at z = -0.10, but its anchors at -1; check that z is the middle"),
-        (2.0, "the centre of this Car is at z = 2.00, outside the grid's -3..1 m; check the line"),
+        (-0.1, False, "objects of class Car are typically centred at z = -0.10, its anchors at -1; check that z is"),
+        (2.0, True, "6 of 6 objects of class Car (100%) lie outside the range x 0..70.4, y -40..40, z -3..1 m, the"),
     ],
 )
-def test_boxes_above_the_ground(tmp_path: Path, z: float, message: str) -> None:
+def test_boxes_above_the_ground(tmp_path: Path, z: float, serious: bool, message: str) -> None:
     root = write_custom(tmp_path)
     (root / "labels/a.txt").write_text("".join(f"{5 + 5 * i} 0 {z} 4 1.6 1.5 0 Car\n" for i in range(6)))
-    findings = [finding for finding in check_dataset(root, config=car()).findings if finding.kind == "height"]
-    assert any(message in finding.text for finding in findings)
-    assert not any(finding.serious for finding in findings)
+    (root / "labels/b.txt").write_text("")
+    (finding,) = [one for one in check_dataset(root, config=car()).findings if message in one.text]
+    assert finding.serious == serious
 
 
 def test_sizes_of_custom_labels(tmp_path: Path) -> None:
     root = write_custom(tmp_path)
-    (root / "labels/a.txt").write_text("5 0 -1 4 0 1.5 7 Car\n")
+    (root / "labels/a.txt").write_text("5 0 -1 4 0 1.5 90 Car\n")
     texts = {f.kind: f.text.split("a.txt, ")[1] for f in check_dataset(root, config=tiny()).findings if f.serious}
     assert texts == {
         "size": "line 1: the size 4 x 0 x 1.5 is not positive; correct or remove the line.",
-        "heading": "line 1: the heading 7 is outside [-pi, pi]; wrap it, in radians.",
+        "heading": "line 1: the heading 90 is beyond two turns; convert degrees to radians.",
     }
+
+
+def test_headings_of_custom_labels_may_wind(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    turns = {kind: (*box[:6], box[6] - 2 * np.pi) for kind, box in OBJECTS.items()}
+    (root / "labels/a.txt").write_text("".join(f"{' '.join(map(str, box))} {kind}\n" for kind, box in turns.items()))
+    assert check_dataset(root, config=tiny()).findings == ()
+
+
+def rename(root: Path, **names: str) -> Path:
+    """Rename types in the labels of the custom layout."""
+    for path in (root / "labels").iterdir():
+        text = path.read_text()
+        for old, new in names.items():
+            text = text.replace(old, new)
+        path.write_text(text)
+    return root
+
+
+def learn(name: str, **changes: object) -> Config:
+    return replace(tiny(), classes=(replace(ClassConfig(name=name), **changes),))
+
+
+def test_no_object_of_a_class_that_is_learned(tmp_path: Path) -> None:
+    report = check_dataset(rename(write_custom(tmp_path), Car="Vehicle", Van="Truck"), config=tiny())
+    text = (
+        "No object is of a class that is learned (Car), but Vehicle (2), Truck (2), Pedestrian (2); write a config for "
+        "them with `ciassd data suggest`."
+    )
+    assert only(report) == Finding("class", True, text)
+    assert report.verdict == f"not ready: 1 error; first: {text}"
+    report = check_dataset(tmp_path, config=learn("vehicle"))
+    assert only(report).kind == "case"
+    assert report.verdict == "ready to train: 2 vehicle objects in range in 2 frames; findings worth a look: 1."
+    assert {(score.name, score.metric) for score in report.scores} == {("vehicle", "bev"), ("vehicle", "3d")}
+
+
+def test_labels_without_an_object(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    for path in (root / "labels").iterdir():
+        path.write_text("")
+    assert only(check_dataset(root, config=car())).text == "No frame has a labelled object; check the labels."
+
+
+def test_anchors_of_another_size(tmp_path: Path) -> None:
+    root = write_custom(tmp_path, names=tuple("abcde"))
+    assert check_dataset(root, config=learn("Car")).findings == ()
+    finding = only(check_dataset(root, config=learn("Car", length=5.2)))
+    assert "objects of class Car are typically 3.90 x 1.60 m large, but its anchors 5.2 x 1.6 m" in finding.text
+
+
+def test_the_share_of_a_class_outside_the_range(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    (root / "labels/a.txt").write_text("".join(f"{2 + 3 * i} 0 -1 3.9 1.6 1.5 0 Car\n" for i in range(7)))
+    (finding,) = [one for one in check_dataset(root, config=learn("Car")).findings if one.kind == "range"]
+    start = (
+        f"3 of 8 objects of class Car (38%) lie outside the range x 0..12.8, y -6.4..6.4, z -3..1 m, the first {root}"
+    )
+    assert finding.text.startswith(f"{start}/labels/a.txt, line 5; check them")
+
+
+def test_intensities_of_another_scale_are_one_error(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    for path in (root / "points").iterdir():
+        np.save(path, np.load(path) * np.float32([1, 1, 1, 255]))
+    finding = only(check_dataset(root, config=tiny()))
+    assert finding.serious
+    assert finding.text.endswith("pass 255 as `intensity_scale`. Other frames with this problem: 1.")
+    assert check_dataset(root, config=replace(tiny(), input=InputConfig(intensity_scale=255.0))).findings == ()
+
+
+def test_the_input_shifts_the_range_and_the_anchors(tmp_path: Path) -> None:
+    root = write_custom(tmp_path, names=tuple("abcde"))
+    for path in (root / "points").iterdir():
+        np.save(path, np.load(path) + np.float32([0, 0, 5, 0]))
+    for path in (root / "labels").iterdir():
+        rows = [line.split() for line in path.read_text().splitlines()]
+        path.write_text("".join(" ".join([*row[:2], str(float(row[2]) + 5), *row[3:]]) + "\n" for row in rows))
+    assert any(finding.serious for finding in check_dataset(root, config=tiny()).findings)
+    assert check_dataset(root, config=replace(tiny(), input=InputConfig(z_shift=-5.0))).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("box", "reason"),
+    [
+        ("-20 0 -1 4 1.6 1.5 0", "outside the sector that the cloud covers"),
+        ("90 0 -1 4 1.6 1.5 0", "beyond the farthest point"),
+        ("1.5 0 -1.2 1 1 1 0", "in the sensor's blind zone"),
+    ],
+)
+def test_boxes_that_cannot_hold_a_point(tmp_path: Path, box: str, reason: str) -> None:
+    root = write_custom(tmp_path)
+    for path in (root / "points").iterdir():
+        points = np.load(path)
+        np.save(path, points[(points[:, 0] > 4) & (points[:, 2] > -0.4 * points[:, 0])])
+    with (root / "labels/a.txt").open("a") as file:
+        file.write(f"{box} Car\n")
+    (finding,) = [one for one in check_dataset(root, config=tiny()).findings if one.kind == "hidden"]
+    assert (
+        f"1 of 7 boxes hold no point because they lie {reason}, the first {root}/labels/a.txt, line 4;" in finding.text
+    )
+
+
+def test_boxes_outside_of_the_cameras_view(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    edit_rows(location=(-1, 1, -8))(root)
+    (finding,) = [one for one in check_dataset(root, config=tiny()).findings if one.kind == "hidden"]
+    assert "they lie outside the camera's view, to which clouds are cropped, the first" in finding.text
+
+
+def test_two_clouds_of_one_frame(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    write_bin(root / "points/a.bin", full_cloud(0))
+    assert only(check_dataset(root, config=tiny())).text.endswith("are clouds of one frame; remove one.")
 
 
 def test_amounts_beyond_a_capacity_and_a_sparse_cloud(tmp_path: Path) -> None:
@@ -293,11 +416,13 @@ def test_images_that_are_not_there_where_clouds_are_cropped(tmp_path: Path) -> N
 
 
 @pytest.mark.reference
-@pytest.mark.parametrize(("folder", "frames", "empty"), [("kitti", 155, 14), ("kitti_full", 6, 0)])
-def test_real_data_have_a_few_boxes_without_points(shared: Path, folder: str, frames: int, empty: int) -> None:
+@pytest.mark.parametrize(
+    ("folder", "frames", "kinds"), [("kitti", 155, ["hidden"] + ["no point"] * 10), ("kitti_full", 6, [])]
+)
+def test_real_data_have_a_few_boxes_without_points(shared: Path, folder: str, frames: int, kinds: list[str]) -> None:
     report = check_dataset(shared / folder)
     assert len(report.frames) == frames
-    assert [finding.kind for finding in report.findings] == ["no point"] * empty
+    assert [finding.kind for finding in report.findings] == kinds
     assert not any(finding.serious for finding in report.findings)
     if folder == "kitti":
         voxels = [frame.voxels for frame in report.frames]
