@@ -70,7 +70,7 @@ def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Ite
         if (inside & (target_labels(frame, config) >= 0)).any():
             return
         found.update(frame.names)
-        outside.update(name for name, within in zip(frame.names, inside.tolist(), strict=True) if not within)
+        outside.update(frame.names[index] for index in np.flatnonzero(~inside).tolist())
     types = ", ".join(f"{name} ({count}, {outside[name]} out of range)" for name, count in found.most_common())
     graded = " and with a difficulty" if config.data.augmentation.filter_scenes else ""
     space = ", ".join(f"{axis} {least:g}..{most:g}" for axis, least, most in zip("xyz", low, high, strict=True))
