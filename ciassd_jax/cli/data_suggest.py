@@ -13,6 +13,7 @@ from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import describe, frames_with_bar, warnings_as_lines
 from ciassd_jax.cli.options import Columns, ImageSize, Unset, read_columns
 from ciassd_jax.data.folders import find_root, open_dataset
+from ciassd_jax.data.splits import ALL
 from ciassd_jax.evaluation.suggest import suggest_config
 from ciassd_jax.formats.writing import check_folder, write_text
 
@@ -23,8 +24,8 @@ class Suggest:
 
     root: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")] = None
     """Folder in KITTI's or OpenPCDet's custom layout; by default the variable KITTI_ROOT."""
-    split: str = "train"
-    """The frames to learn from: train, val, trainval, all, or a file that lists them."""
+    split: str = ALL
+    """The frames to fit: train, val, trainval, all, or a file that lists them."""
     classes: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TYPE [TYPE ...]", help_behavior_hint="")] = None
     """The types to learn. Default: all with at least 5 % of the objects."""
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
@@ -34,11 +35,11 @@ class Suggest:
     """Write the config to this file instead."""
 
     def run(self) -> int:
-        root, base = find_root(self.root), self.config_options.resolve()
+        root, base, columns = find_root(self.root), self.config_options.resolve(), read_columns(self.columns)
         if self.out is not None:
             check_folder(self.out.parent)
         with warnings_as_lines(root):
-            dataset = open_dataset(root, self.split, self.image_size, read_columns(self.columns))
+            dataset = open_dataset(root, self.split, self.image_size, columns, need_labels=False)
             config, notes = suggest_config(dataset, base, classes=self.classes, track=frames_with_bar)
         print(*map(describe, notes), sep="\n", file=sys.stderr)
         if self.out is None:

@@ -21,7 +21,7 @@ _WIDE, _LONG = 1 / 1.2, 1.5
 # Fewer objects have no typical shape and height.
 _FEW = 5
 # Share of a class that may lie outside the range, and relative difference of a typical object and its anchor.
-_MAX_OUTSIDE, _MAX_DIFFERENCE = 0.05, 0.3
+_MAX_OUTSIDE, _MAX_DIFFERENCE = 0.1, 0.3
 
 
 class Labels(NamedTuple):

@@ -114,23 +114,26 @@ def check_dataset(
     findings = [*_check_names(listed, source, folder, places), *([] if split else _check_split_files(root))]
     if twice := same_stem(present_paths(folder, places["cloud"])):
         findings.append(Finding("cloud", True, f"{twice[0]} and {twice[1]} are clouds of one frame; remove one."))
-    read: Callable[..., Frame] = partial(read_custom_frame, root=root, columns=columns)
-    if not is_custom(root):
-        read = partial(read_kitti_frame, folder=folder, image_size=image_size, columns=columns)
-        if image_size is None and (guess := crop_without_images(folder, names)):
-            findings.append(Finding("image size", False, guess))
+    if not is_custom(root) and image_size is None and (guess := crop_without_images(folder, names)):
+        findings.append(Finding("image size", False, guess))
+    read: Callable[..., Frame] = partial(read_kitti_frame, folder=folder, image_size=image_size)
+    read = partial(read_custom_frame, root=root) if is_custom(root) else read
+    # A frame may lack its label file, and those of test have none.
+    read = partial(read, labelled=None if "label" in places else False, columns=columns)
     frames: list[Checked] = []
     with collected_warnings() as told:
         for name in track(names):
-            cloud, label = (find_file(folder, places.get(kind, ()), name) for kind in ("cloud", "label"))
-            assert cloud is not None, "frames without a cloud are left out"
-            frames += _check_frame(partial(read, name, labelled=label is not None), cloud, config, findings)
-    findings = [*_once(findings, "intensity"), *_group(told), *_check_clouds(frames, config)]
+            cloud = find_file(folder, places["cloud"], name)
+            frames += _check_frame(partial(read, name), str(cloud), config, findings)
+    return _report([*_once(findings, "intensity"), *_group(told)], frames, config)
+
+
+def _report(findings: list[Finding], frames: Sequence[Checked], config: Config) -> Report:
+    """Add what only all frames together show."""
     labelled = [one for one in frames if one.frame.rows is not None]
     labels = join_labels([one.frame for one in labelled], [one.inside for one in labelled])
-    scores = score_labels([one.frame for one in frames], config)
-    if labelled:
-        findings += check_classes(labels, config)
+    scores = score_labels([one.frame for one in labelled], config)
+    findings += [*_check_clouds(frames, config), *(check_classes(labels, config) if labelled else ())]
     findings += [*_check_empty(labelled), *_check_amounts(frames, config), *check_scores(scores)]
     types, targets = summarise_types(labels, config), count_targets(labels, config)
     return Report(tuple(findings), tuple(frames), types, targets, tuple(scores))
@@ -162,7 +165,7 @@ def _check_split_files(root: Path) -> Iterator[Finding]:
         yield Finding("split", True, f"{text}; remove them from one of the two.")
 
 
-def _check_frame(read: Callable[..., Frame], cloud: Path, config: Config, findings: list[Finding]) -> Iterator[Checked]:
+def _check_frame(read: Callable[..., Frame], cloud: str, config: Config, findings: list[Finding]) -> Iterator[Checked]:
     """Read and check one frame; yields nothing for one that cannot be read."""
     problems: list[InputError] = []
     try:

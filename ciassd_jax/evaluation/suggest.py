@@ -208,7 +208,7 @@ def _listed(types: dict[str, int]) -> str:
 
 def _class_notes(config: Config, types: dict[str, int]) -> tuple[str, ...]:
     notes = [
-        f"Class {c.name}: {types[c.name]} objects, anchors of {c.length:g} x {c.width:g} x {c.height:g} m centred at "
+        f"Class {c.name} ({types[c.name]}): anchors of {c.length:g} x {c.width:g} x {c.height:g} m centred at "
         f"z = {c.center_z - config.input.z_shift:g} m."
         for c in config.classes
     ]

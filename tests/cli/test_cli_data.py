@@ -108,7 +108,7 @@ def test_the_remedy_for_an_unknown_class_is_true(run: Any, tmp_path: Path) -> No
     assert suggested.code == 0
     path.write_text(suggested.out)
     assert Config.from_json(suggested.out).class_names == ("Vehicle",)
-    assert suggested.err.startswith("Class Vehicle: 2 objects, anchors of 3.9 x 1.6 x 1.5 m centred at z = -1 m.\n")
+    assert suggested.err.startswith("Class Vehicle (2): anchors of 3.9 x 1.6 x 1.5 m centred at z = -1 m.\n")
     assert "Left out: Truck (2), Pedestrian (2); name a type with --classes to learn it" in suggested.err
     accepted = run("data", "check", root, "--config", path)
     assert accepted.code == 0
@@ -135,7 +135,7 @@ def test_prepare_writes_the_database(run: Any, tmp_path: Path) -> None:
     result = run("data", "prepare", root, "--split", "all", "--out", tmp_path / "out")
     assert result.code == 0
     path = tmp_path / "out" / "objects_all.bin"
-    assert result.out == f"Wrote the objects of 3 frames to {path}.\n"
+    assert result.out.splitlines()[0] == f"Wrote the objects of 3 frames to {path}."
     database = open_database(path, open_dataset(root, "all"))
     assert len(database.objects) == 3 * len(OBJECTS)
     assert not (root / "training/velodyne_reduced").exists()
