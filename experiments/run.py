@@ -33,7 +33,7 @@ from study import Study
 from ciassd_jax import Config, open_dataset
 from ciassd_jax.__main__ import keep_programs
 from ciassd_jax.cli.messages import warnings_as_lines
-from ciassd_jax.cli.options import load_as
+from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.data.folders import find_root
 from ciassd_jax.data.workers import WorkerError
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace, command: str) -> None:
     if options.weights is not None and not experiment.takes_weights:
         raise InputError(f"{options.name} trains the networks that it compares; remove --weights.")
     data = find_root(options.data) if experiment.takes_data else None
-    weights = None if options.weights is None else load_as(options.weights, options.preset)
+    weights = None if options.weights is None else ConfigOptions(options.preset).load(options.weights)
     config = config_of(options, weights)
     settings = settings_of(config, options, data)
     check_folder(options.out)

@@ -88,7 +88,8 @@ class ConfigOptions:
         try:
             check_fits(weights, config, path)
         except InputError as error:
-            raise UsageError(f"The options choose another config: {error}") from error
+            named = f"--preset {self.preset}" if self.preset else f"--config {self.config}" if self.config else "--config."
+            raise UsageError(f"{named} cannot be used with these weights: {error}") from error
         return weights._replace(config=config)
 
 

@@ -90,6 +90,11 @@ class Config:
         return (x, y, low - shift), (right, left, high - shift)
 
     @property
+    def ground(self) -> float:
+        """Height in metres at which the anchors of the first class stand, in the frame of the clouds."""
+        return self.classes[0].center_z - self.classes[0].height / 2 - self.input.z_shift
+
+    @property
     def bev_shape(self) -> tuple[int, int]:
         """Cells (y, x) of the BEV map."""
         return self.backbone.stage_shapes(self.grid.shape)[-1][1:]

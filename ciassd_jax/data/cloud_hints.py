@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 Vector = tuple[float, float, float]
 
-_MIN_POINTS = 100
+_MIN_POINTS = 1000
 # No more points are read.
 _SAMPLE = 20_000
 _MIN_IN_RANGE = 0.1
@@ -24,7 +24,7 @@ def describe_cloud(
 
     Few points lie in the range from `minimum` to `maximum`, or the ground that they show is not at the height
     `ground` where the anchors stand; all in metres in the frame of the points, that is, before `z_shift` is added.
-    Fewer than 100 points give no hint.
+    Fewer than 1000 points give no hint.
     """
     if len(points) < _MIN_POINTS:
         return []

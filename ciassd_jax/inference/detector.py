@@ -13,7 +13,8 @@ import jax
 import numpy as np
 
 from ciassd_jax.config import Config
-from ciassd_jax.formats.errors import DroppedWarning, Pathlike
+from ciassd_jax.data.cloud_hints import describe_cloud
+from ciassd_jax.formats.errors import DroppedWarning, Pathlike, warn_of_file
 from ciassd_jax.formats.points import check_intensity
 from ciassd_jax.inference.predict import compile_predict
 from ciassd_jax.inference.results import FrameResult, frame_result
@@ -37,6 +38,7 @@ class Detector:
     def __init__(self, variables: Variables, config: Config) -> None:
         self.config = config
         self._variables = jax.device_put(jax.device_get(variables_of(variables)))
+        self._is_first = True
 
     @classmethod
     def from_pretrained(cls, path_or_name: str | os.PathLike[str]) -> Detector:
@@ -59,8 +61,8 @@ class Detector:
 
         `frustum` [6, 4] (`ops.camera.frustum_planes`) drops boxes outside the camera's view. Intensities lie between 0
         and `config.input.intensity_scale`; single ones outside are clipped. Warns of these, and of points, voxels,
-        sites and candidates that were dropped; `source` names the cloud in errors. Raises InputError if many
-        intensities lie outside, and ValueError for points of another shape.
+        sites and candidates that were dropped, and once if the cloud is unlike what the config expects; `source` names
+        the cloud. Raises InputError if many intensities lie outside, and ValueError for points of another shape.
         """
         detect = partial(self._detect, frustum=frustum, source=source)
         if isinstance(points, np.ndarray | jax.Array):
@@ -69,14 +71,28 @@ class Detector:
         return list(map(detect, points))
 
     def _detect(self, points: Array, *, frustum: np.ndarray | None, source: Pathlike) -> FrameResult:
-        points, clipped = check_intensity(_check_shape(points), self.config.input.intensity_scale, source)
+        scale = self.config.input.intensity_scale
+        points, clipped = check_intensity(_check_shape(points), scale, source)
+        if clipped:
+            text = f"{source}: {clipped} of {len(points)} intensities were clipped to [0, {scale:g}]."
+            warn_of_file(text, source, stacklevel=5)
+        self._describe_first(points, source)
         program = self.compile(len(points))
         start = time.perf_counter()
         planes = ANYWHERE if frustum is None else np.asarray(frustum, np.float32)
         batch = jax.device_get(program(self._variables, pad_to_bucket(points), frustum=planes[None]))
-        result = frame_result(batch, self.config, time.perf_counter() - start, clipped=clipped)
-        _warn_of_drops(result.counts, self._count_invalid(points))
+        seconds = time.perf_counter() - start
+        changed = {"clipped": clipped, "invalid": self._count_invalid(points)}
+        result = frame_result(batch, self.config, seconds, changed)
+        _warn_of_drops(result.counts)
         return result
+
+    def _describe_first(self, points: np.ndarray, source: Pathlike) -> None:
+        """Give the hints on the first cloud; those on the others would be the same."""
+        if self._is_first:
+            self._is_first = False
+            for hint in describe_cloud(points, *self.config.range, self.config.ground, self.config.input.z_shift):
+                warn_of_file(f"{source}: {hint}", source, stacklevel=6)
 
     def _count_invalid(self, points: np.ndarray) -> int:
         """The points that the voxelisation drops whatever its capacity."""
@@ -110,20 +126,18 @@ def _check_shape(points: Array) -> np.ndarray:
     return np.asarray(points, np.float32)
 
 
-def _warn_of_drops(counts: dict[str, Any], invalid: int) -> None:
-    """Warn once of everything that was clipped or dropped, if anything was."""
+def _warn_of_drops(counts: dict[str, Any]) -> None:
+    """Warn once of everything that was dropped, if anything was."""
     lost = []
     points, voxels = counts["points"], counts["voxels"]
-    if points["clipped"]:
-        lost.append(f"the excess of {points['clipped']} of {points['given']} intensities outside their range")
-    if invalid:
-        lost.append(f"{invalid} of {points['given']} points that are not finite or have an impossible intensity")
+    if points["invalid"]:
+        lost.append(f"{points['invalid']} of {points['given']} points that are not finite or have an impossible intensity")
     if not points["in_range"]:
         lost.append(f"all {points['given']} points, none of which is in range")
     if voxels["dropped"]:
         lost.append(
             f"{voxels['dropped']} voxels beyond the {voxels['kept']} that fit (grid.max_voxels), with "
-            f"{points['dropped'] - invalid} points"
+            f"{points['dropped'] - points['invalid']} points"
         )
     lost += [
         f"{stage['dropped']} sites of backbone stage {i + 1} beyond the {stage['kept']} that fit (its capacity)"

@@ -90,15 +90,15 @@ class FrameResult:
         }
 
 
-def frame_result(batch: Detections, config: Config, seconds: float, *, clipped: int = 0) -> FrameResult:
-    """Return the detections of a batch of one scene as NumPy arrays.
+def frame_result(batch: Detections, config: Config, seconds: float, changed: dict[str, int]) -> FrameResult:
+    """Return the detections of a batch of one scene, which took `seconds`, as NumPy arrays.
 
-    They took `seconds`, and `clipped` of its intensities were clipped before.
+    `changed` are the numbers of its points that were changed or dropped before, by reason.
     """
     scene = jax.tree.map(lambda leaf: np.asarray(leaf[0]), batch)
     count = int(scene.count)
     labels = tuple(config.class_names[label] for label in scene.label[:count])
-    counts = _plain_counts(scene.counts, clipped)
+    counts = _plain_counts(scene.counts, changed)
     return FrameResult(scene.boxes.to_array()[:count], scene.score[:count], labels, counts, seconds)
 
 
@@ -123,11 +123,11 @@ def write_json(path: Path, result: FrameResult) -> Path:
     return path
 
 
-def _plain_counts(counts: Counts, clipped: int) -> dict[str, Any]:
+def _plain_counts(counts: Counts, changed: dict[str, int]) -> dict[str, Any]:
     """Return the counts of one scene as nested plain numbers."""
     value = {name: np.asarray(leaf).tolist() for name, leaf in counts._asdict().items()}
     return {
-        "points": {name: value[f"points_{name}"] for name in ("given", "in_range", "dropped")} | {"clipped": clipped},
+        "points": {name: value[f"points_{name}"] for name in ("given", "in_range", "dropped")} | changed,
         "voxels": {name: value[f"voxels_{name}"] for name in ("kept", "dropped")},
         "sites": [
             {"kept": kept, "dropped": dropped}

@@ -77,7 +77,7 @@ def detect_dataset(
         with warnings.catch_warnings():
             # `describe_dropped` sums the same counts over all frames.
             warnings.filterwarnings("ignore", "Dropped ", DroppedWarning)
-            result = detector(frame.points, frustum=frustum_of(frame.camera))
+            result = detector(frame.points, frustum=frustum_of(frame.camera), source=f"Frame {frame.name}")
         scored.append(score_frame(frame, truth, result))
     if dropped := describe_dropped(scored):
         warnings.warn(dropped, DroppedWarning, stacklevel=2)
@@ -145,6 +145,7 @@ def _dropped(frames: Sequence[Scored]) -> list[str]:
             lost[f"sites of backbone stage {stage} beyond its capacity"] = sites["dropped"]
         lost["candidates beyond detection.max_candidates"] = counts["candidates"]["dropped"]
         points = counts["points"]
+        lost["points with an impossible intensity"] = points["invalid"]
         lost["points of frames without a point in range"] = 0 if points["in_range"] else points["given"]
         for reason, amount in lost.items():
             amounts.setdefault(reason, []).append(amount)

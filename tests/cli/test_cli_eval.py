@@ -222,7 +222,7 @@ BAD: dict[str, tuple[Change, str]] = {
         r"kitti has neither best\.safetensors nor last\.safetensors",
     ),
     "another config": (lambda w: {"preset": "car"}, r"--preset car .*another config: .* tensors "),
-    "threshold": (lambda w: {"score-threshold": 1.5}, r"score_threshold: 1\.5 is outside"),
+    "threshold": (lambda w: {"score-threshold": 1.5}, r"--config\.detection\.score-threshold\): 1\.5 is outside"),
     "no data": (lambda w: {"data": w / "none"}, r"none has no folder training or testing \(KITTI\) or points"),
     "no split": (lambda w: {"split": "mine"}, r"ImageSets/mine\.txt does not exist; write it"),
     "absent frames": (lambda w: {"split": "train"}, r"3711 of 3712 frames have no cloud .*; copy them, or list"),

@@ -49,7 +49,7 @@ def test_one_cloud_gives_json_and_a_table(run: Any, weights: Path, tmp_path: Pat
     assert data["seconds"] > 0
     counts = data["counts"]
     assert {name: set(part) for name, part in counts.items() if name != "sites"} == {
-        "points": {"given", "in_range", "dropped"},
+        "points": {"given", "in_range", "dropped", "clipped", "invalid"},
         "voxels": {"kept", "dropped"},
         "candidates": {"kept", "dropped"},
     }
@@ -145,24 +145,26 @@ def test_calibration_can_be_named(run: Any, weights: Path, kitti: Path, tmp_path
 def test_what_was_dropped_is_one_line_with_the_file(run: Any, weights: Path, tmp_path: Path) -> None:
     folder = tmp_path / "clouds"
     folder.mkdir()
-    byte, spoilt = small_cloud() * np.float32([1, 1, 1, 255]), small_cloud()
+    bright, spoilt = small_cloud(), small_cloud()
+    bright[3, 3] = 4
     spoilt[:5, 1] = np.nan
-    write_bin(folder / "byte.bin", byte)
+    write_bin(folder / "bright.bin", bright)
     write_bin(folder / "nan.bin", spoilt)
     write_bin(folder / "far.bin", small_cloud() + np.float32([500, 0, 0, 0]))
     np.save(folder / "xyz.npy", small_cloud()[:, :3])
     result = run("predict", folder, "--weights", weights, "--out", tmp_path / "out")
     assert result.code == 0
     lines = [line for line in re.split(r"[\r\n]+", result.err) if "warning" in line]
-    assert re.fullmatch(r"warning: \S+byte\.bin: 600 intensities of up to 25\d\.?\d* were divided by 255: .*", lines[0])
-    assert lines[1].endswith("far.bin: Dropped all 600 points, none of which is in range.")
-    assert lines[2].endswith("nan.bin: Dropped 5 of 600 points that are not finite.")
-    assert lines[3] == f"warning: {folder / 'xyz.npy'} has no intensity; 0 is used instead."
+    assert lines[0] == f"warning: {folder / 'bright.bin'}: 1 of 600 intensities were clipped to [0, 1]."
+    assert lines[1].endswith("Dropped all 600 points, none of which is in range.")
+    assert lines[2] == f"warning: {folder / 'nan.bin'}: 5 of 600 points are not finite; they were left out."
+    assert lines[3].startswith(f"warning: {folder / 'xyz.npy'} has no intensity")
     assert len(lines) == 4
     assert ".py" not in result.err
     far = json.loads((tmp_path / "out" / "far.json").read_text())
     assert (far["boxes"], far["scores"], far["labels"]) == ([], [], [])
-    assert json.loads((tmp_path / "out" / "nan.json").read_text())["counts"]["points"]["dropped"] == 5
+    assert json.loads((tmp_path / "out" / "nan.json").read_text())["counts"]["points"]["given"] == 595
+    assert json.loads((tmp_path / "out" / "bright.json").read_text())["counts"]["points"]["clipped"] == 1
 
 
 def test_other_warnings_are_left_alone(run: Any, weights: Path, tmp_path: Path, monkeypatch: Any) -> None:
@@ -178,7 +180,7 @@ def test_other_warnings_are_left_alone(run: Any, weights: Path, tmp_path: Path, 
 def test_threshold_and_dtype_override_the_file(run: Any, weights: Path, tmp_path: Path, monkeypatch: Any) -> None:
     configs = []
 
-    def detect(detector: Detector, points: Any, frustum: Any) -> FrameResult:
+    def detect(detector: Detector, points: Any, **options: Any) -> FrameResult:
         configs.append(detector.config)
         return FrameResult(np.zeros((0, 7)), np.zeros(0), (), {}, 0.0)
 
@@ -241,9 +243,9 @@ BAD: dict[str, tuple[Callable[[Path], dict[str, Any]], str]] = {
     "no torch file": (lambda t: {"weights": write(t / "x.pth", b"junk")}, r"x\.pth is damaged or .*PyTorch"),
     "another config": (
         lambda t: {"preset": "car"},
-        r"--preset car .*small\.safetensors .*another config: .* tensors ",
+        r"--preset car cannot be used with these weights: .*small\.safetensors .*another config: .* tensors ",
     ),
-    "threshold": (lambda t: {"score-threshold": 1.5}, r"score_threshold: 1\.5 is outside \[0, 1\)"),
+    "threshold": (lambda t: {"score-threshold": 1.5}, r"--config\.detection\.score-threshold\): 1\.5 is outside \[0, 1\)"),
     "out is a file": (
         lambda t: {"out": write(t / "file", b"")},
         r"file cannot be a folder, as .*file is a file",

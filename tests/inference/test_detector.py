@@ -14,8 +14,8 @@ import pytest
 from small import random_variables, small_cloud, small_config
 
 from ciassd_jax import Boxes, Detections, Detector, PointCloud, save_weights
-from ciassd_jax.config import LossConfig, ScheduleConfig
-from ciassd_jax.formats.errors import DroppedWarning, InputError
+from ciassd_jax.config import InputConfig, LossConfig, ScheduleConfig
+from ciassd_jax.formats.errors import DroppedWarning, FormatWarning, InputError
 from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.types import Counts
 
@@ -92,13 +92,23 @@ def test_points_that_are_not_finite_are_dropped_and_named(detector: Detector) ->
 
 
 @pytest.mark.usefixtures("quiet")
-def test_intensity_of_a_byte_is_divided_and_named(detector: Detector) -> None:
-    byte, fraction = small_cloud(), small_cloud()
-    byte[:, 3] = (byte[:, 3] * 255).round()
-    fraction[:, 3] = byte[:, 3] / 255
-    with pytest.warns(DroppedWarning, match=r"^600 intensities of up to 2\d\d were divided by 255"):
-        result = detector(byte)
-    np.testing.assert_array_equal(result.boxes, detector(fraction).boxes)
+def test_a_single_intensity_out_of_range_is_clipped_and_named(detector: Detector) -> None:
+    bright, clipped = small_cloud(), small_cloud()
+    bright[7, 3], clipped[7, 3] = 4, 1
+    with pytest.warns(FormatWarning, match=r"^The cloud: 1 of 600 intensities were clipped to \[0, 1\]\.$"):
+        result = detector(bright)
+    assert result.counts["points"]["clipped"] == 1
+    np.testing.assert_array_equal(result.boxes, detector(clipped).boxes)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_intensities_of_another_scale_are_refused_until_the_scale_is_given(detector: Detector) -> None:
+    byte = np.round(small_cloud() * 64) / 64 * np.float32([1, 1, 1, 256])
+    with pytest.raises(InputError, match=r"^The cloud has 9\d\.\d % of its intensities .*; pass .* as `intensity_scale`"):
+        detector(byte)
+    config = replace(small_config(), input=InputConfig(intensity_scale=256.0))
+    result = Detector(random_variables(small_config()), config)(byte)
+    np.testing.assert_array_equal(result.boxes, detector(byte / np.float32([1, 1, 1, 256])).boxes)
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 4), np.float32), np.full((9, 4), 500, np.float32) * [1, 1, 1, 0]])
