@@ -88,7 +88,9 @@ class ConfigOptions:
         try:
             check_fits(weights, config, path)
         except InputError as error:
-            named = f"--preset {self.preset}" if self.preset else f"--config {self.config}" if self.config else "--config."
+            named = (
+                f"--preset {self.preset}" if self.preset else f"--config {self.config}" if self.config else "--config."
+            )
             raise UsageError(f"{named} cannot be used with these weights: {error}") from error
         return weights._replace(config=config)
 

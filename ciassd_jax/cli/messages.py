@@ -25,8 +25,8 @@ _OPTIONS = {
     "as `columns`": "with --columns",
     "as `intensity_scale`": "with --intensity-scale",
     "as `z_shift`": "with --z-shift",
-    "as `limits`": "with --overlap",
     "as `classes`": "with --classes",
+    "leave out `calib`": "leave out --calib",
     "`overwrite`": "--overwrite",
     "`write_synthetic`": "`ciassd data synth`",
 }

@@ -111,7 +111,10 @@ class Train:
             validation = self.data_set.open(self.validate, self.seed)
         config, intervals = self._config(len(dataset)), self._intervals()
         # Before minutes of compilation and hours of training for nothing.
-        check_targets(dataset, config)
+        if not check_targets(dataset, config, frames_with_bar) and self.overfit_one is not None:
+            raise UsageError(
+                f"Frame {self.overfit_one} has no target to overfit; name another frame, or another range."
+            )
         variables = self._variables(config)
         batches = self._batches(dataset, config, self._database(dataset, config, folder, log))
         fitted = fit(

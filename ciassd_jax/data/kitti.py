@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from ciassd_jax.data.frames import Dataset, Frame, clean_points
+from ciassd_jax.data.frames import Dataset, Frame, clean_points, difficulty_by_points
 from ciassd_jax.data.splits import (
     Places,
     describe_places,
@@ -26,6 +26,8 @@ from ciassd_jax.formats.kitti_rows import ObjectRow, difficulty_of, is_dont_care
 from ciassd_jax.formats.points import read_points, write_bin
 from ciassd_jax.formats.writing import replacing
 from ciassd_jax.ops.camera import inside_planes
+from ciassd_jax.ops.footprints import points_in_boxes
+from ciassd_jax.types import Boxes
 
 REDUCED, FULL = "velodyne_reduced/{}.bin", "velodyne/{}.bin"
 IMAGE = "image_2/{}.png"
@@ -93,10 +95,17 @@ def read_kitti_frame(
 def kitti_frame(
     name: str, points: Float32[np.ndarray, "P 4"], rows: tuple[ObjectRow, ...] | None, camera: Camera
 ) -> Frame:
-    """Return a frame with KITTI's label rows, DontCare among them; `rows` are None for a frame without labels."""
+    """Return a frame with KITTI's label rows, DontCare among them; `rows` are None for a frame without labels.
+
+    The difficulty of an object without an image box is by the number of points in its box.
+    """
     objects = [row for row in rows or () if not is_dont_care(row.type)]
-    difficulty = np.array([difficulty_of(row) for row in objects], np.int64)
     boxes = rows_to_boxes(objects, camera.calibration)
+    difficulty = np.array([difficulty_of(row) for row in objects], np.int64)
+    bare = [index for index, row in enumerate(objects) if not row.has_image_box]
+    if bare:
+        inside = points_in_boxes(points, Boxes(*(leaf[bare] for leaf in boxes))).sum(-1)
+        difficulty[bare] = difficulty_by_points(np.asarray(inside))
     return Frame(name, points, boxes, tuple(row.type for row in objects), difficulty, camera, rows)
 
 

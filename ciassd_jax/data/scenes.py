@@ -53,31 +53,39 @@ def target_labels(frame: Frame, config: Config) -> Int[np.ndarray, " G"]:
     return np.where(frame.difficulty < 0, np.int32(OBSTACLE), label) if augmentation.filter_scenes else label
 
 
-def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Iterable[int]] = iter) -> None:
-    """Raise InputError, which tells what the labels have, unless a target lies in the range of the grid.
+def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Iterable[int]] = iter) -> bool:
+    """Return whether a target lies in the range of the grid; gives a FormatWarning if all lie outside.
 
-    Reads up to the first frame with a target. `track` wraps the iteration over the frames, for a progress bar.
+    Reads up to the first frame with a target. `track` wraps the iteration over the frames, for a progress bar. Raises
+    InputError, which tells what the labels have, if no object is of a class that is learned.
     """
     low, high = (np.array(limit) for limit in config.range)
     found: Counter[str] = Counter()
-    outside: Counter[str] = Counter()
+    learned = 0
     for index in track(range(len(dataset))):
         # The loader reads the frames again and gives their warnings.
         with collected_warnings():
             frame = dataset.read(index)
-        center = np.asarray(frame.boxes.center)
-        inside = ((center >= low) & (center <= high)).all(-1)
-        if (inside & (target_labels(frame, config) >= 0)).any():
-            return
+        of_class = target_labels(frame, config) >= 0
+        inside = ((frame.boxes.center >= low) & (frame.boxes.center <= high)).all(-1)
+        if (of_class & inside).any():
+            return True
+        learned += int(of_class.sum())
         found.update(frame.names)
-        outside.update(frame.names[index] for index in np.flatnonzero(~inside).tolist())
-    types = ", ".join(f"{name} ({count}, {outside[name]} out of range)" for name, count in found.most_common())
-    graded = " and with a difficulty" if config.data.augmentation.filter_scenes else ""
-    space = ", ".join(f"{axis} {least:g}..{most:g}" for axis, least, most in zip("xyz", low, high, strict=True))
+    names = ", ".join(config.class_names)
+    if learned:
+        space = ", ".join(f"{axis} {least:g}..{most:g}" for axis, least, most in zip("xyz", low, high, strict=True))
+        warn_of_file(
+            f"All {learned} objects of the classes that are learned ({names}) lie outside the grid, {space} m; choose "
+            "a range with `ciassd data suggest`."
+        )
+        return False
+    types = ", ".join(f"{name} ({count})" for name, count in found.most_common())
+    graded = " with a difficulty" if config.data.augmentation.filter_scenes else ""
     raise InputError(
         f"None of {found.total()} labelled objects in {len(dataset)} frames is of a class that is learned "
-        f"({', '.join(config.class_names)}), within {space} m{graded}; the labels have {types or 'no objects'}, so "
-        "choose classes and range with `ciassd data suggest`, or list a type as `similar` of a class."
+        f"({names}){graded}; the labels have {types or 'no objects'}, so choose classes with `ciassd data suggest`, or "
+        "list a type as `similar` of a class."
     )
 
 

@@ -40,6 +40,7 @@ from ciassd_jax.evaluation.class_check import (
 )
 from ciassd_jax.evaluation.frame_check import Finding, check_rows, explain_empty
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike, collected_warnings, give_grouped
+from ciassd_jax.formats.kitti_rows import ObjectRow
 from ciassd_jax.formats.points import check_intensity
 from ciassd_jax.ops.footprints import points_in_boxes
 
@@ -125,7 +126,7 @@ def check_dataset(
         for name in track(names):
             cloud = find_file(folder, places["cloud"], name)
             frames += _check_frame(partial(read, name), str(cloud), config, findings)
-    return _report([*_once(findings, "intensity"), *_group(told)], frames, config)
+    return _report([*_once(_without_images(findings, frames), "intensity"), *_group(told)], frames, config)
 
 
 def _report(findings: list[Finding], frames: Sequence[Checked], config: Config) -> Report:
@@ -189,6 +190,15 @@ def _check_frame(read: Callable[..., Frame], cloud: str, config: Config, finding
     sample = background[:: max(len(background) // _SAMPLE, 1)]
     hidden = explain_empty(frame, inside)
     yield Checked(frame._replace(points=sample), len(frame.points), clipped, inside, voxels, hidden)
+
+
+def _without_images(findings: Sequence[Finding], frames: Sequence[Checked]) -> list[Finding]:
+    """Say once that no label has an image box, instead of naming each as an error: these are of another format."""
+    rows = [row for one in frames for row in one.frame.objects if isinstance(row, ObjectRow)]
+    if not rows or any(row.has_image_box for row in rows):
+        return list(findings)
+    text = f"None of the {len(rows)} objects has an image box; their difficulty is by the number of points instead."
+    return [*(one for one in findings if one.kind != "image box"), Finding("image box", False, text)]
 
 
 def _once(findings: Sequence[Finding], kind: str) -> Iterator[Finding]:

@@ -39,7 +39,7 @@ class Finding(NamedTuple):
 def check_rows(frame: Frame) -> Iterator[Finding]:
     """Check the rows of a frame's labels, and that their image boxes lie where its camera sees their boxes."""
     places: dict[ObjectRow | CustomRow, str] = {}
-    for row in frame.rows or ():
+    for row in frame.objects:
         if (first := places.setdefault(row._replace(place=""), row.place)) != row.place:
             text = f"{row.place}: the same object as in {first}; remove one of the two lines."
             yield Finding("repeated row", True, text)
@@ -62,7 +62,7 @@ def _check_row(row: ObjectRow | CustomRow, size: Float[np.ndarray, 3]) -> Iterat
     if abs(row.rotation_y) > _KITTI_HEADING:
         text = f"{place}: the heading {row.rotation_y:g} is outside [-pi, pi]; wrap it, in radians."
         yield Finding("heading", True, text)
-    if row.bbox[2] <= row.bbox[0] or row.bbox[3] <= row.bbox[1]:
+    if not row.has_image_box:
         yield Finding("image box", True, f"{place}: the image box is empty; write left, top, right, bottom in pixels.")
     if not 0 <= row.truncated <= 1 or row.occluded not in range(4):
         yield Finding("occlusion", True, f"{place}: truncation must lie in 0..1 and occlusion be 0, 1, 2 or 3.")
@@ -72,7 +72,9 @@ def _check_row(row: ObjectRow | CustomRow, size: Float[np.ndarray, 3]) -> Iterat
 
 def _check_projection(frame: Frame) -> Iterator[Finding]:
     """Compare the image boxes of fully visible objects with the projections of their boxes."""
-    pairs = [(row, seen) for row, seen in project_rows(frame) if row.truncated == 0 and row.occluded == 0]
+    pairs = [
+        (row, seen) for row, seen in project_rows(frame) if row.has_image_box and row.truncated == row.occluded == 0
+    ]
     overlap = float(np.median([image_overlap(row.bbox, seen.bbox) if seen else 0.0 for row, seen in pairs] or [1.0]))
     if overlap < _SAME:
         text = f"the boxes project elsewhere than their image boxes lie (overlap {overlap:.2f})"

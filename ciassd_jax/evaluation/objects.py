@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int
 
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.formats.errors import InputError
-from ciassd_jax.formats.kitti_rows import DONT_CARE, ObjectRow, difficulty_of
+from ciassd_jax.formats.kitti_rows import ObjectRow, difficulty_of, is_dont_care
 from ciassd_jax.ops.footprints import points_in_boxes
 from ciassd_jax.types import Boxes
 
@@ -79,7 +79,7 @@ def labels_from_frame(frame: Frame) -> LabelledObjects:
         raise InputError(f"Frame {frame.name} has no labels to compare with; choose a split of labelled frames.")
     rows = cast(tuple[ObjectRow, ...], frame.rows)
     points = np.zeros(len(rows), np.int64)
-    points[[row.type != DONT_CARE for row in rows]] = inside
+    points[[not is_dont_care(row.type) for row in rows]] = inside
     return labels_from_rows(rows)._replace(points=points)
 
 

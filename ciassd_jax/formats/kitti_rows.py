@@ -34,6 +34,12 @@ class ObjectRow(NamedTuple):
     score: float | None = None
     place: str = ""
 
+    @property
+    def has_image_box(self) -> bool:
+        """Whether the image box has an area; labels that come from other formats often have none."""
+        x1, y1, x2, y2 = self.bbox
+        return x2 > x1 and y2 > y1
+
 
 class ResultFile(NamedTuple):
     """The rows of a result file, and the places ("FILE, line N") of its irregular lines.

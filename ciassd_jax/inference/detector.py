@@ -131,7 +131,9 @@ def _warn_of_drops(counts: dict[str, Any]) -> None:
     lost = []
     points, voxels = counts["points"], counts["voxels"]
     if points["invalid"]:
-        lost.append(f"{points['invalid']} of {points['given']} points that are not finite or have an impossible intensity")
+        lost.append(
+            f"{points['invalid']} of {points['given']} points that are not finite or have an impossible intensity"
+        )
     if not points["in_range"]:
         lost.append(f"all {points['given']} points, none of which is in range")
     if voxels["dropped"]:

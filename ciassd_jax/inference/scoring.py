@@ -11,7 +11,7 @@ import numpy as np
 
 from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Dataset, Frame
-from ciassd_jax.evaluation.kitti_ap import limits_of
+from ciassd_jax.evaluation.kitti_ap import LIMITS, limits_of
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_frame
 from ciassd_jax.evaluation.summary import Evaluation, evaluate
 from ciassd_jax.formats.errors import (
@@ -58,9 +58,18 @@ def score_dataset(
 def score_frames(frames: Sequence[Scored], config: Config) -> Evaluation:
     """Return the average precision of the config's classes by KITTI's rules, at the overlaps of `limits_of`.
 
-    Without a camera, the points in a box define its difficulty.
+    Without a camera, the points in a box define its difficulty. Labels that are `similar` to a class count as the
+    class, as in training; those of KITTI's classes are neutral, as in the official program.
     """
-    return evaluate([frame.truth for frame in frames], [frame.detections for frame in frames], limits_of(config))
+    official = {name.lower() for name in LIMITS}
+    counted = {
+        name.lower(): one.name for one in config.classes if one.name.lower() not in official for name in one.similar
+    }
+    truths = [
+        frame.truth._replace(types=tuple(counted.get(name.lower(), name) for name in frame.truth.types))
+        for frame in frames
+    ]
+    return evaluate(truths, [frame.detections for frame in frames], limits_of(config))
 
 
 def detect_dataset(
@@ -77,7 +86,10 @@ def detect_dataset(
         with warnings.catch_warnings():
             # `describe_dropped` sums the same counts over all frames.
             warnings.filterwarnings("ignore", "Dropped ", DroppedWarning)
-            result = detector(frame.points, frustum=frustum_of(frame.camera), source=f"Frame {frame.name}")
+            try:
+                result = detector(frame.points, frustum=frustum_of(frame.camera))
+            except InputError as error:
+                raise InputError(f"Frame {frame.name}: {error}") from error
         scored.append(score_frame(frame, truth, result))
     if dropped := describe_dropped(scored):
         warnings.warn(dropped, DroppedWarning, stacklevel=2)

@@ -8,7 +8,7 @@ from typing import Any, get_args
 import pytest
 
 from ciassd_jax.cli import main
-from ciassd_jax.cli.options import Preset
+from ciassd_jax.cli.config_options import Preset
 from ciassd_jax.config.presets import PRESETS
 
 

@@ -42,7 +42,12 @@ def test_a_field_is_replaced_in_any_of_them(shown: Any, weights: Path, tmp_path:
     assert config == replace(tiny(), grid=grid)
     bus = replace(PEOPLE.classes[2], name="Bus", similar=("Truck", "Tram"))
     config = shown(
-        "--config.classes.2.name=Bus", "--config.classes.2.similar", "Truck", "Tram", "--config", tmp_path / "config.json"
+        "--config.classes.2.name=Bus",
+        "--config.classes.2.similar",
+        "Truck",
+        "Tram",
+        "--config",
+        tmp_path / "config.json",
     )
     assert config == replace(PEOPLE, classes=(*PEOPLE.classes[:2], bus))
     assert shown("--weights", weights, "--config.schedule.total-steps", 7).schedule.total_steps == 7
@@ -57,7 +62,10 @@ def test_an_option_of_the_command_wins_over_the_config(shown: Any) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("--config.grid.bogus", "3"), "--config.grid.bogus is no field of this config; --help-config lists the fields."),
+        (
+            ("--config.grid.bogus", "3"),
+            "--config.grid.bogus is no field of this config; --help-config lists the fields.",
+        ),
         (("--config.classes.1.name", "Bus"), "--config.classes.1.name is no field of this config"),
         (("--z-shift", "1", "--config.input.z-shift", "1"), "--config.input.z-shift sets a field that another option"),
         (("--config.dtype", "bfloat16", "--config.dtype", "float32"), "--config.dtype is given twice; give it once."),
@@ -103,7 +111,10 @@ def test_info_explains_the_grid(run: Any, monkeypatch: pytest.MonkeyPatch) -> No
     lines = json.loads(run("info", "--json").out)["grid"]
     assert lines[0] == "x: 0 to 70.4 m, 1408 voxels of 0.05 m; next valid maximum 69.6 or 71.2."
     assert lines[3] == "Layers along z: 41 -> 21 -> 11 -> 5 -> 2, with 64 channels each in the BEV map."
-    assert lines[4] == "BEV map: 176 x 200 cells of 0.4 m (stride 8, so x and y are multiples of 16 voxels), 70400 anchors."
+    assert (
+        lines[4]
+        == "BEV map: 176 x 200 cells of 0.4 m (stride 8, so x and y are multiples of 16 voxels), 70400 anchors."
+    )
     config = Config()
     for maximum in (69.6, 71.2):
         replace(config, grid=replace(config.grid, maximum=(maximum, 40.0, 1.0)))

@@ -245,7 +245,10 @@ BAD: dict[str, tuple[Callable[[Path], dict[str, Any]], str]] = {
         lambda t: {"preset": "car"},
         r"--preset car cannot be used with these weights: .*small\.safetensors .*another config: .* tensors ",
     ),
-    "threshold": (lambda t: {"score-threshold": 1.5}, r"--config\.detection\.score-threshold\): 1\.5 is outside \[0, 1\)"),
+    "threshold": (
+        lambda t: {"score-threshold": 1.5},
+        r"--config\.detection\.score-threshold\): 1\.5 is outside \[0, 1\)",
+    ),
     "out is a file": (
         lambda t: {"out": write(t / "file", b"")},
         r"file cannot be a folder, as .*file is a file",

@@ -317,7 +317,11 @@ def test_a_config_needs_no_static_argnames():
 @pytest.mark.parametrize(
     ("kind", "given", "sentence"),
     [
-        (GridConfig, {"maximum": (0.0, 40.0, 1.0)}, r"grid.minimum to grid.maximum along x: .* the maximum must exceed the minimum"),
+        (
+            GridConfig,
+            {"maximum": (0.0, 40.0, 1.0)},
+            r"grid.minimum to grid.maximum along x: .* the maximum must exceed the minimum",
+        ),
         (
             GridConfig,
             {"maximum": (70.4, -41.0, 1.0)},

@@ -11,13 +11,15 @@ from small import CALIBRATION, IMAGE_SIZE
 
 from ciassd_jax.data.clouds import find_clouds, find_image, read_cloud
 from ciassd_jax.data.folders import open_dataset
-from ciassd_jax.data.frames import Frame
+from ciassd_jax.data.frames import Frame, difficulty_by_points
 from ciassd_jax.data.kitti import crop_to_view, read_seen_points, write_reduced
+from ciassd_jax.evaluation.objects import labels_from_frame
 from ciassd_jax.formats.errors import FormatWarning, InputError
 from ciassd_jax.formats.kitti_boxes import boxes_to_rows, rows_to_boxes
 from ciassd_jax.formats.kitti_camera import Camera, lidar_to_image, read_camera
 from ciassd_jax.formats.kitti_rows import DONT_CARE, ObjectRow, read_labels
 from ciassd_jax.formats.points import read_points, write_bin
+from ciassd_jax.ops.footprints import points_in_boxes
 
 # A focal length of KITTI's, whose image is 1242 x 375.
 KITTI_CALIBRATION = CALIBRATION.replace("300", "721.5377")
@@ -145,6 +147,21 @@ def test_own_types_and_areas_in_any_case(tmp_path: Path) -> None:
     assert [row.type for row in frame.objects] == ["Car", "Forklift", "Pedestrian"]
     assert frame.rows is not None
     assert len(frame.rows) == 4
+
+
+def test_without_image_boxes_points_give_the_difficulty(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    path = root / "training/label_2/000000.txt"
+    usual = read_first(root)
+    rows = [line.split() for line in path.read_text().splitlines()]
+    path.write_text("".join(" ".join([*row[:4], "0", "0", "0", "0", *row[8:]]) + "\n" for row in rows))
+    frame = read_first(root)
+    inside = np.asarray(points_in_boxes(frame.points, frame.boxes)).sum(-1)
+    np.testing.assert_array_equal(frame.difficulty, difficulty_by_points(inside))
+    assert (frame.difficulty >= 0).all()
+    np.testing.assert_allclose(frame.boxes.to_array(), usual.boxes.to_array())
+    labels = labels_from_frame(frame)
+    assert sorted(labels.types) == sorted([*OBJECTS, "DontCare"])
 
 
 def test_a_missing_image_is_warned_of_once_where_clouds_are_cropped(tmp_path: Path) -> None:

@@ -138,6 +138,18 @@ def test_every_bad_line_is_named(tmp_path: Path) -> None:
     assert [text.split(": ")[0].removeprefix(f"{path}, ") for text in texts] == ["line 5", "line 6"]
 
 
+def test_labels_without_any_image_box_are_one_finding(tmp_path: Path) -> None:
+    root = write_kitti(tmp_path)
+    for path in (root / "training/label_2").iterdir():
+        write_rows(path, [row._replace(bbox=(0, 0, 0, 0)) for row in read_rows(path)])
+    found = only(check_dataset(root, config=tiny()))
+    assert found == Finding(
+        "image box",
+        False,
+        "None of the 9 objects has an image box; their difficulty is by the number of points instead.",
+    )
+
+
 def test_a_repeated_label_names_both_lines(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
     path = root / "training/label_2/000001.txt"

@@ -104,7 +104,9 @@ def test_a_single_intensity_out_of_range_is_clipped_and_named(detector: Detector
 @pytest.mark.usefixtures("quiet")
 def test_intensities_of_another_scale_are_refused_until_the_scale_is_given(detector: Detector) -> None:
     byte = np.round(small_cloud() * 64) / 64 * np.float32([1, 1, 1, 256])
-    with pytest.raises(InputError, match=r"^The cloud has 9\d\.\d % of its intensities .*; pass .* as `intensity_scale`"):
+    with pytest.raises(
+        InputError, match=r"^The cloud has 9\d\.\d % of its intensities .*; pass .* as `intensity_scale`"
+    ):
         detector(byte)
     config = replace(small_config(), input=InputConfig(intensity_scale=256.0))
     result = Detector(random_variables(small_config()), config)(byte)

@@ -40,7 +40,7 @@ class Oracle(Detector):
     def __call__(self, points: Any, *, frustum: np.ndarray | None = None) -> FrameResult:
         boxes, labels = self._find(points)
         counts = {
-            "points": {"given": len(points), "in_range": len(points), "dropped": 0},
+            "points": {"given": len(points), "in_range": len(points), "dropped": 0, "invalid": 0},
             "voxels": {"kept": 1, "dropped": 0},
             "sites": [],
             "candidates": {"kept": len(boxes), "dropped": 0},
@@ -282,3 +282,18 @@ def test_golden_weights_on_real_frames(shared: Path, tmp_path: Path) -> None:
     again = written(frames, shared / "kitti/training/label_2", tmp_path)
     assert_same_precision(score_frames(frames, CONFIG), again, ROUNDING)
     assert again.num_frames == 3
+
+
+def test_labels_similar_to_an_own_class_count_as_it_and_those_of_a_car_do_not(tmp_path: Path) -> None:
+    dataset = open_dataset(write_custom(tmp_path), "all")
+    bus = ClassConfig(name="Bus", similar=("VAN", "Car"))
+
+    def found_of(*classes: ClassConfig) -> Evaluation:
+        oracle = Oracle(lambda points: (object_boxes().to_array(), ("Bus",) * len(OBJECTS)))
+        return score_frames(detect_dataset(oracle, dataset), Config(classes=classes))
+
+    curves = found_of(bus).curves["Bus", "3d", 0.5]
+    assert curves is not None
+    assert curves[2].num_truths == 2 * sum(name in ("Car", "Van") for name in OBJECTS)
+    car = found_of(ClassConfig(name="car", similar=("Van",))).curves["car", "3d", 0.7]
+    assert car is None
