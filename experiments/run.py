@@ -32,8 +32,8 @@ from study import Study
 
 from ciassd_jax import Config, open_dataset
 from ciassd_jax.__main__ import keep_programs
-from ciassd_jax.cli.messages import warnings_as_lines
 from ciassd_jax.cli.config_options import ConfigOptions
+from ciassd_jax.cli.messages import warnings_as_lines
 from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.data.folders import find_root
 from ciassd_jax.data.workers import WorkerError

@@ -95,7 +95,7 @@ class ConfigOptions:
         return weights._replace(config=config)
 
 
-def _replace_field(config: Config, name: str, value: object) -> Config:
+def _replace_field(config: Config, name: str, value: Any) -> Config:
     """Return the config with the field "section.field" or "field" replaced."""
     section, _, field = name.rpartition(".")
     if not section:

@@ -23,8 +23,8 @@ from ciassd_jax.inference.results import FrameResult, write_result
 class Predict:
     """Detect objects in a cloud or a folder of clouds.
 
-    Writes OUT/NAME.json for every cloud. If it has a calibration, the cloud is cropped to the camera's view, and KITTI's
-    rows are written as OUT/NAME.txt.
+    Writes OUT/NAME.json for every cloud. A cloud with a calibration is cropped to the camera's view, and KITTI's rows
+    are written as OUT/NAME.txt.
     """
 
     path: Annotated[Path, tyro.conf.Positional]

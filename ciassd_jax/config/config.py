@@ -21,7 +21,6 @@ from ciassd_jax.config.model import (
 )
 from ciassd_jax.config.training import DataConfig, LossConfig, ScheduleConfig
 
-
 Vector = tuple[float, float, float]
 
 
@@ -63,8 +62,8 @@ class Config:
                 below = cells // multiple * multiple
                 valid = " or ".join(f"{low + n * size:g}" for n in (below, below + multiple) if n)
                 raise ValueError(
-                    f"grid.maximum along {axis}: {cells} voxels are not divisible by {multiple} ({self.backbone.stride} "
-                    f"voxels per BEV cell, and the neck halves the map); the nearest valid maximum is {valid}."
+                    f"grid.maximum along {axis}: {cells} voxels are not divisible by {multiple} (a BEV cell has "
+                    f"{self.backbone.stride}, and the neck halves the map); the nearest valid maximum is {valid}."
                 )
         depths = [shape[0] for shape in self.backbone.stage_shapes(grid.shape)]
         if depths[-1] < 1:

@@ -43,8 +43,8 @@ class GridConfig:
         for axis, low, high, size in zip("xyz", self.minimum, self.maximum, self.voxel_size, strict=True):
             if not (size > 0 and 0 < high - low < math.inf):
                 raise ValueError(
-                    f"grid.minimum to grid.maximum along {axis}: range {low}..{high} with voxel size {size} is empty or "
-                    "unbounded; the maximum must exceed the minimum, both must be finite, and the voxel size positive."
+                    f"grid.minimum to grid.maximum along {axis}: range {low}..{high} with voxel size {size} is empty "
+                    "or unbounded; the maximum must exceed the minimum, both be finite, and the voxel size positive."
                 )
             cells = (high - low) / size
             if round(cells) < 1 or abs(cells - round(cells)) > 1e-3:

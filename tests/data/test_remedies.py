@@ -212,9 +212,9 @@ def test_labels_of_other_classes_are_refused_and_both_remedies_work(tmp_path: Pa
     config, dataset = tiny(), open_dataset(root, "train")
     car = replace(config.classes[0], similar=())
     message = (
-        r"None of 6 labelled objects in 2 frames is of a class that is learned \(Car\); the labels have Forklift \(2\), "
-        r"Van \(2\), Pedestrian \(2\), so choose classes with `ciassd data suggest`, or list a type as `similar` of a "
-        r"class\."
+        r"None of 6 labelled objects in 2 frames is of a class that is learned \(Car\); the labels have "
+        r"Forklift \(2\), Van \(2\), Pedestrian \(2\), so choose classes with `ciassd data suggest`, or list a type as "
+        r"`similar` of a class\."
     )
     with pytest.raises(InputError, match=message):
         check_targets(dataset, replace(config, classes=(car,)))
