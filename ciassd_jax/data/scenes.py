@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Int
 
 from ciassd_jax.config import Config
+from ciassd_jax.data.cloud_hints import describe_cloud
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.formats.errors import InputError, collected_warnings, warn_of_file
 from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
@@ -56,7 +57,7 @@ def target_labels(frame: Frame, config: Config) -> Int[np.ndarray, " G"]:
 def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Iterable[int]] = iter) -> bool:
     """Return whether a target lies in the range of the grid; gives a FormatWarning if all lie outside.
 
-    Reads up to the first frame with a target. `track` wraps the iteration over the frames, for a progress bar. Raises
+    Gives another one if the first cloud is unlike what the config expects (`describe_cloud`). Reads up to the first frame with a target. `track` wraps the iteration over the frames, for a progress bar. Raises
     InputError, which tells what the labels have, if no object is of a class that is learned.
     """
     low, high = (np.array(limit) for limit in config.range)
@@ -66,6 +67,9 @@ def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Ite
         # The loader reads the frames again and gives their warnings.
         with collected_warnings():
             frame = dataset.read(index)
+        if index == 0:
+            for hint in describe_cloud(frame.points, *config.range, config.ground, config.input.z_shift):
+                warn_of_file(f"Frame {frame.name}: {hint}", stacklevel=2)
         of_class = target_labels(frame, config) >= 0
         inside = ((frame.boxes.center >= low) & (frame.boxes.center <= high)).all(-1)
         if (of_class & inside).any():
