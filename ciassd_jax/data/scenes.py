@@ -57,8 +57,9 @@ def target_labels(frame: Frame, config: Config) -> Int[np.ndarray, " G"]:
 def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Iterable[int]] = iter) -> bool:
     """Return whether a target lies in the range of the grid; gives a FormatWarning if all lie outside.
 
-    Gives another one if the first cloud is unlike what the config expects (`describe_cloud`). Reads up to the first frame with a target. `track` wraps the iteration over the frames, for a progress bar. Raises
-    InputError, which tells what the labels have, if no object is of a class that is learned.
+    Gives another one if the first cloud is unlike what the config expects (`describe_cloud`). Reads up to the first
+    frame with a target. `track` wraps the iteration over the frames, for a progress bar. Raises InputError, which tells
+    what the labels have, if no object is of a class that is learned.
     """
     low, high = (np.array(limit) for limit in config.range)
     found: Counter[str] = Counter()

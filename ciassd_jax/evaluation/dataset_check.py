@@ -224,12 +224,11 @@ def _check_clouds(frames: Sequence[Checked], config: Config) -> Iterator[Finding
         text = f"{points} points in {len(clipped)} of {len(frames)} frames, the first {clipped[0].frame.name}, have an"
         scale = config.input.intensity_scale
         yield Finding("intensity", False, f"{text} intensity outside [0, {scale:g}]; training clips it.")
-    first, shift = config.classes[0], config.input.z_shift
     sample = np.concatenate([np.zeros((0, 4), np.float32), *(one.frame.points for one in frames)])
     # Whether the range fits is seen from objects, where there are any.
     anywhere = (-math.inf,) * 3, (math.inf,) * 3
     extent = anywhere if any(len(one.inside) for one in frames) else config.range
-    for hint in describe_cloud(sample, *extent, first.center_z - first.height / 2 - shift, shift):
+    for hint in describe_cloud(sample, *extent, config.ground, config.input.z_shift):
         yield Finding("cloud", False, hint)
     usual = float(np.median([one.points for one in frames] or [0]))
     for one in frames:
