@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import tyro
 
@@ -97,10 +97,10 @@ class ConfigOptions:
 
 def _replace_field(config: Config, name: str, value: Any) -> Config:
     """Return the config with the field "section.field" or "field" replaced."""
-    section, _, field = name.rpartition(".")
+    section, _, last = name.rpartition(".")
     if not section:
         return dataclasses.replace(config, **{name: value})
-    part = dataclasses.replace(getattr(config, section), **{field: value})
+    part = dataclasses.replace(getattr(config, section), **{last: value})
     return dataclasses.replace(config, **{section: part})
 
 
@@ -115,8 +115,7 @@ class _Fields:
 class _Source:
     """The options that name a config."""
 
-    preset: Unset[Preset] = None
-    config: Unset[Path] = None
+    config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     weights: Unset[Path] = None
     workdir: Unset[Path] = None
 
@@ -156,6 +155,4 @@ def _source(arguments: Sequence[str]) -> Config:
         weights = find_trained(named.workdir)
     if arguments[0] == "demo" and weights is None:
         weights = Path("car_lite")
-    chosen = ConfigOptions(named.preset, named.config)
-    own = read_config(find_weights(weights)) if weights and not (named.preset or named.config) else None
-    return chosen.chosen(own)
+    return named.config_options.chosen(read_config(find_weights(weights)) if weights else None)

@@ -137,8 +137,7 @@ def _check_case(labels: Labels, label: Int[np.ndarray, " G"], config: Config) ->
         if name not in written:
             mine = np.flatnonzero(labels.types == name)
             text = f"{labels.places[mine[0]]}: the type {name} ({len(mine)} objects) is learned as the class"
-            remedy = "results are written like the class, so write its name in the same case to get this one back."
-            yield Finding("case", False, f"{text} {config.class_names[label[mine[0]]]}; {remedy}")
+            yield Finding("case", False, f"{text} {config.class_names[label[mine[0]]]}, because case does not matter.")
 
 
 def _check_class(

@@ -137,7 +137,6 @@ class _Run:
     saved: int
     skipped: int
     skipped_in_a_row: int = 0
-    without_positives: bool = False
     pending: list[dict[str, Any]] = field(default_factory=list)
     since: float = field(default_factory=time.perf_counter)
 
@@ -217,12 +216,6 @@ class _Run:
         numbers = summarise(rows) | {"epoch": self._epoch(step), "seconds": seconds}
         distributed.on_process_0(lambda: self.metrics.write(step, numbers) if self.metrics is not None else None)
         self.pending, self.since = [], time.perf_counter()
-        if numbers["positives"] == 0 and not self.without_positives:
-            self.log(
-                f"warning: no anchor was positive in {len(rows)} steps, so nothing is learned; check the sizes and "
-                "overlaps of the classes and the range of the grid with `ciassd data check`."
-            )
-        self.without_positives = numbers["positives"] == 0
         self.log(describe_metrics(step, self.config.schedule.total_steps, numbers))
         if self.skipped_in_a_row >= _MAX_SKIPPED:
             raise TrainingError(

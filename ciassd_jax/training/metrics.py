@@ -76,12 +76,16 @@ def summarise(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
 
 
 def describe_metrics(step: int, total: int, numbers: Mapping[str, float]) -> str:
-    """Return one line on the summarised metrics of a training of `total` steps, with the overflow counts above 0."""
+    """Return one line on the summarised metrics of a training of `total` steps.
+
+    It has the overflow counts above 0, and a warning if no anchor was positive.
+    """
     dropped = [f"{name} {value:.0f}" for name, value in numbers.items() if _is_overflow_count(name) and value]
-    return (
-        f"step {step}/{total}  epoch {numbers['epoch']:.2f}  loss {numbers['loss']:.4f}"
-        f"  {numbers['seconds']:.2f} s/step" + (f"  ({', '.join(dropped)})" if dropped else "")
-    )
+    line = f"step {step}/{total}  epoch {numbers['epoch']:.2f}  loss {numbers['loss']:.4f}"
+    line += f"  {numbers['seconds']:.2f} s/step" + (f"  ({', '.join(dropped)})" if dropped else "")
+    if numbers["positives"]:
+        return line
+    return f"{line}  warning: no anchor is positive, so nothing is learned; run `ciassd data check` with this config"
 
 
 def _is_overflow_count(name: str) -> bool:

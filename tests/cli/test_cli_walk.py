@@ -26,7 +26,9 @@ def test_from_files_to_a_detector(run: Any, tmp_path: Path) -> None:
     assert "objects of class Forklift" in done("info", "--config", config, "--data", yard)
     assert done("data", "check", yard, "--config", config).splitlines()[-1].startswith("Verdict: ready to train: ")
     scale = ("--intensity-scale", 2)
-    trained = done("train", "--config", config, "--data", yard, "--workdir", work, "--steps", 3, "--log-every", 1, *scale)
+    trained = done(
+        "train", "--config", config, "--data", yard, "--workdir", work, "--steps", 3, "--log-every", 1, *scale
+    )
     assert "Forklift_3d_0.50_moderate_R40" in trained
     lines = [json.loads(line) for line in (work / "metrics.jsonl").read_text().splitlines()]
     assert all(line["positives"] > 0 for line in lines if "positives" in line)

@@ -95,7 +95,7 @@ LABEL, CALIB = r"label_2/000000\.txt, line", r"calib/000000\.txt"
         (
             edit("training/label_2/000000.txt", "Car 0.0000", "car 0.0000"),
             False,
-            rf"{LABEL} 1: the type car \(1 objects\) is learned as the class Car; results are written like the class",
+            rf"{LABEL} 1: the type car \(1 objects\) is learned as the class Car, because case does not matter\.",
         ),
         (edit("training/calib/000000.txt", "P2:", "P9:"), True, rf"{CALIB} has no line P2; use"),
         (edit_rows(rotation_y=90.0), True, rf"{LABEL} 1: the heading 90 is outside \[-pi, pi\]; wrap it, in radians"),

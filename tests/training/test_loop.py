@@ -32,7 +32,7 @@ from ciassd_jax.simulation import Lidar
 from ciassd_jax.training import loop
 from ciassd_jax.training.checkpoint import Checkpoints
 from ciassd_jax.training.loop import Fitted, Intervals, TrainingError, fit
-from ciassd_jax.training.metrics import MetricsLog
+from ciassd_jax.training.metrics import MetricsLog, describe_metrics
 from ciassd_jax.training.signals import deferred_signals
 from ciassd_jax.types import TrainState
 
@@ -298,3 +298,11 @@ def test_an_ignored_signal_stays_ignored() -> None:
         signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     assert received == []
+
+
+@pytest.mark.parametrize("positives", [0.0, 1.5])
+def test_a_line_warns_of_steps_without_positives(positives: float) -> None:
+    numbers = {"epoch": 1.0, "loss": 0.5, "seconds": 0.1, "positives": positives, "sites_dropped": 2.0}
+    line = describe_metrics(50, 100, numbers)
+    assert line.startswith("step 50/100  epoch 1.00  loss 0.5000  0.10 s/step  (sites_dropped 2)")
+    assert ("no anchor is positive" in line) == (positives == 0)
