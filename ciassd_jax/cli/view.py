@@ -87,6 +87,8 @@ class View:
         frames = [read_source(sources[name], image=self.image) for name in frames_with_bar(list(sources))]
         if weights is not None:
             detector = Detector(weights.variables, config)
+            if cropped := sum(frame.whole and frame.camera is not None for frame in frames):
+                print(f"In {cropped} whole clouds the detector gets the points that the camera sees, as in evaluation.")
             return [_detect(detector, frame) for frame in frames_with_bar(frames)]
         for frame in frames:
             _check_intensity(frame, config.input.intensity_scale)

@@ -1,6 +1,7 @@
 """`config.input`: intensity scale and z shift, which the network applies and its boxes do not show."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import chex
@@ -52,8 +53,8 @@ def test_voxels_and_targets_of_another_sensor_are_the_same() -> None:
     shifted = scene.truth._replace(boxes=boxes._replace(center=boxes.center - np.float32([[0, 0, SHIFT]])))
     found, expected = (
         (
-            voxelize_batch(PointCloud(points[None], scene.cloud.count[None]), one),
-            assign_targets(truth, *make_anchors(one), one.classes),
+            jax.jit(voxelize_batch)(PointCloud(points[None], scene.cloud.count[None]), one),
+            jax.jit(partial(assign_targets, classes=one.classes))(truth, *make_anchors(one)),
         )
         for points, truth, one in (
             (usual, scene.truth, config),
