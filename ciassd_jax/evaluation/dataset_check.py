@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -112,7 +113,8 @@ def check_dataset(
     names = [name for name in dict.fromkeys(listed) if all(find_file(folder, paths, name) for paths in needed)]
     if not names:
         raise InputError(f"{source} names no frame that exists; check the path.")
-    findings = [*_check_names(listed, source, folder, places), *([] if split else _check_split_files(root))]
+    used = set(listed) if split else _used_names(root, listed)
+    findings = [*_check_names(listed, source, folder, places, used), *([] if split else _check_split_files(root))]
     if twice := same_stem(present_paths(folder, places["cloud"])):
         findings.append(Finding("cloud", True, f"{twice[0]} and {twice[1]} are clouds of one frame; remove one."))
     if not is_custom(root) and image_size is None and (guess := crop_without_images(folder, names)):
@@ -140,12 +142,27 @@ def _report(findings: list[Finding], frames: Sequence[Checked], config: Config) 
     return Report(tuple(findings), tuple(frames), types, targets, tuple(scores))
 
 
-def _check_names(names: Sequence[str], source: str, folder: Path, places: Places) -> Iterator[Finding]:
+def _used_names(root: Path, names: Sequence[str]) -> set[str]:
+    """Return the frames that any file of ImageSets but test.txt lists, or all of them without such a file."""
+    used: set[str] = set()
+    for path in present_paths(root, ("ImageSets/{}.txt",)):
+        if path.stem != "test":
+            with suppress(InputError):  # `_check_split_files` reports it.
+                used.update(listed_names(root, path.stem, *frame_files(root, path.stem))[0])
+    return used or set(names)
+
+
+def _check_names(
+    names: Sequence[str], source: str, folder: Path, places: Places, used: Collection[str]
+) -> Iterator[Finding]:
     for clause in repeated_names(names):
         yield Finding("split", True, f"{source}: {clause}; list it once.")
-    for clause in missing_files(folder, places, names):
-        remedy = "copy them, or leave these frames out of the split; without objects a label file is empty"
+    for clause in missing_files(folder, places, [name for name in names if name in used]):
+        remedy = "copy them, or list only the other frames in ImageSets; without objects a label file is empty"
         yield Finding("missing file", True, f"{source}: {clause}; {remedy}.")
+    for clause in missing_files(folder, places, [name for name in names if name not in used]):
+        text = f"{source}: of the frames that ImageSets does not list for training or validation, {clause}"
+        yield Finding("missing file", False, f"{text}; these are not used.")
 
 
 def _check_split_files(root: Path) -> Iterator[Finding]:
@@ -159,7 +176,7 @@ def _check_split_files(root: Path) -> Iterator[Finding]:
             yield Finding("split", True, str(error))
             continue
         splits[path.stem] = set(names)
-        yield from _check_names(names, source, folder, {"cloud": places["cloud"]})
+        yield from _check_names(names, source, folder, {"cloud": places["cloud"]}, names)
     shared = sorted(splits.get("train", set()) & splits.get("val", set()))
     if shared:
         text = f"{root / 'ImageSets'}: train.txt and val.txt share {len(shared)} frames, the first {shared[0]}"

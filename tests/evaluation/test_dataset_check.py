@@ -227,6 +227,20 @@ def test_split_files(tmp_path: Path) -> None:
     assert [finding.kind for finding in report.findings] == ["split"] + ["missing file"] * 3
 
 
+def test_a_frame_that_no_split_lists_may_lack_its_labels(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    (root / "labels/b.txt").unlink()
+    report = check_dataset(root, config=tiny())
+    assert only(report).serious
+    assert "(b); copy them, or list only the other frames in ImageSets" in only(report).text
+    write_split(root, "train", "a")
+    write_split(root, "test", "b")
+    report = check_dataset(root, config=tiny())
+    assert not only(report).serious
+    assert "1 of 1 frames have no label" in only(report).text
+    assert report.verdict.startswith("ready to train: ")
+
+
 def test_the_official_list_where_frames_are_missing(tmp_path: Path) -> None:
     report = check_dataset(write_kitti(tmp_path), "train", config=tiny())
     assert "The official list of train: 3711 of 3712 frames have no cloud" in report.findings[0].text
