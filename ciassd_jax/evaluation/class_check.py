@@ -171,9 +171,12 @@ def _check_class(
         yield Finding("height", False, f"{places[0]} and others: {text}; {check}, {remedy}.")
 
 
-def score_labels(frames: Sequence[Frame], config: Config) -> list[LabelScore]:
-    """Score the labels as detections of score 1, for every class and metric that can be evaluated."""
-    pairs, limits = [_as_detections(frame) for frame in frames], limits_of(config)
+def score_labels(frames: Sequence[Frame], inside: Sequence[Int[np.ndarray, " G"]], config: Config) -> list[LabelScore]:
+    """Score the labels as detections of score 1, for every class and metric that can be evaluated.
+
+    `inside` is the number of points in each box of each frame.
+    """
+    pairs, limits = [_as_detections(*each) for each in zip(frames, inside, strict=True)], limits_of(config)
     found = evaluate([truth for truth, _ in pairs], [detections for _, detections in pairs], limits)
     scores = []
     for name, (limit, *_) in limits.items():
@@ -185,14 +188,14 @@ def score_labels(frames: Sequence[Frame], config: Config) -> list[LabelScore]:
     return scores
 
 
-def _as_detections(frame: Frame) -> tuple[LabelledObjects, DetectedObjects]:
+def _as_detections(frame: Frame, inside: Int[np.ndarray, " G"]) -> tuple[LabelledObjects, DetectedObjects]:
     """Return the labels and the same as detections; with a camera, through the LiDAR frame and back."""
     if frame.camera is None:
         labels = LabelledObjects(frame.names, frame.difficulty, frame.boxes)
         return labels, DetectedObjects(frame.names, np.ones(len(frame.names)), frame.boxes)
     pairs, fields = project_rows(frame), ("location", "dimensions", "rotation_y")
     found = [row._replace(score=1.0, **{name: getattr(seen or row, name) for name in fields}) for row, seen in pairs]
-    return labels_from_rows([row for row, _ in pairs]), detections_from_rows(found)
+    return labels_from_rows([row for row, _ in pairs])._replace(points=inside), detections_from_rows(found)
 
 
 def check_scores(scores: Sequence[LabelScore]) -> Iterator[Finding]:

@@ -134,8 +134,8 @@ def check_dataset(
 def _report(findings: list[Finding], frames: Sequence[Checked], config: Config) -> Report:
     """Add what only all frames together show."""
     labelled = [one for one in frames if one.frame.rows is not None]
-    labels = join_labels([one.frame for one in labelled], [one.inside for one in labelled])
-    scores = score_labels([one.frame for one in labelled], config)
+    frames_with_labels, inside = [one.frame for one in labelled], [one.inside for one in labelled]
+    labels, scores = join_labels(frames_with_labels, inside), score_labels(frames_with_labels, inside, config)
     findings += [*_check_clouds(frames, config), *(check_classes(labels, config) if labelled else ())]
     findings += [*_check_empty(labelled), *_check_amounts(frames, config), *check_scores(scores)]
     types, targets = summarise_types(labels, config), count_targets(labels, config)

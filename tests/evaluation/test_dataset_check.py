@@ -142,12 +142,17 @@ def test_labels_without_any_image_box_are_one_finding(tmp_path: Path) -> None:
     root = write_kitti(tmp_path)
     for path in (root / "training/label_2").iterdir():
         write_rows(path, [row._replace(bbox=(0, 0, 0, 0)) for row in read_rows(path)])
-    found = only(check_dataset(root, config=tiny()))
+    report = check_dataset(root, config=tiny())
+    found = only(report)
     assert found == Finding(
         "image box",
         False,
         "None of the 9 objects has an image box; their difficulty is by the number of points instead.",
     )
+    points = [n for one in report.frames for n, name in zip(one.inside, one.frame.names, strict=True) if name == "Car"]
+    levels = tuple(sum(n >= least for n in points) for least in (100, 30, 5))
+    assert levels[0] < levels[2]
+    assert {score.objects for score in report.scores} == {levels}
 
 
 def test_a_repeated_label_names_both_lines(tmp_path: Path) -> None:
