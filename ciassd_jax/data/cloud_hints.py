@@ -52,7 +52,8 @@ def describe_cloud(
 
 def _ground_height(coordinates: Float32[np.ndarray, "N 3"], ground: float) -> float | None:
     """Return the most frequent height near the sensor, or None if no height is frequent."""
-    near = np.hypot(coordinates[:, 0], coordinates[:, 1]) < _NEAR
+    # A damaged coordinate may be near the largest float32.
+    near = np.hypot(coordinates[:, 0], coordinates[:, 1], dtype=np.float64) < _NEAR
     lowest = ground - 10
     heights = coordinates[near & (np.abs(coordinates[:, 2] - ground) < 10), 2]
     if len(heights) < _MIN_POINTS:

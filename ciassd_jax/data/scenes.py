@@ -85,11 +85,15 @@ def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Ite
             "a range with `ciassd data suggest`."
         )
         return False
+    if not found:
+        raise InputError(
+            f"None of {len(dataset)} frames has a labelled object; check the labels, or choose another split."
+        )
     types = ", ".join(f"{name} ({count})" for name, count in found.most_common())
     graded = " with a difficulty" if config.data.augmentation.filter_scenes else ""
     raise InputError(
         f"None of {found.total()} labelled objects in {len(dataset)} frames is of a class that is learned "
-        f"({names}){graded}; the labels have {types or 'no objects'}, so choose classes with `ciassd data suggest`, or "
+        f"({names}){graded}; the labels have {types}, so choose classes with `ciassd data suggest`, or "
         "list a type as `similar` of a class."
     )
 

@@ -10,6 +10,8 @@ from ciassd_jax.config import Config
 Triple = tuple[int, int, int]
 
 
+# A damaged coordinate may be near the largest float32.
+@np.errstate(over="ignore")
 def occupied_voxels(points: Float[np.ndarray, "P 4"], config: Config) -> Int[np.ndarray, " V"]:
     """Return the voxels that hold a point of a cloud, as indices into the flat grid `config.grid.shape`."""
     grid = config.grid

@@ -57,7 +57,7 @@ def read_ply(data: bytes, path: Pathlike) -> list[tuple[str, np.ndarray]]:
     last = vertex is elements[-1]
     if storage == "ascii":
         rows = _read_ascii(body, before, vertex, path, last=last)
-        return [(name, rows[:, index]) for index, (name, _) in enumerate(vertex.properties)]
+        return [(name, _as_stored(rows[:, index], kind)) for index, (name, kind) in enumerate(vertex.properties)]
     order = _FORMATS[storage]
     row = vertex.row_type(order)
     start = sum(element.rows * element.row_type(order).itemsize for element in before)
@@ -77,6 +77,12 @@ def _read_ascii(body: bytes, before: list[_Element], vertex: _Element, path: Pat
         return np.array(words[: vertex.rows * width], np.float64).reshape(vertex.rows, width)
     except ValueError as error:
         raise InputError(f"{path} has a vertex that is not made of numbers; save it again.") from error
+
+
+def _as_stored(values: np.ndarray, kind: str | None) -> np.ndarray:
+    """Return the values as bytes if the header says so."""
+    is_byte = kind == "u1" and ((values >= 0) & (values <= 255)).all()
+    return values.astype(np.uint8) if is_byte else values
 
 
 def _check_rows(announced: int, held: int, path: Pathlike, *, last: bool) -> None:

@@ -25,6 +25,8 @@ _COLUMNS = ("x", "y", "z", "intensity")
 _INTENSITIES = ("intensity", "reflectivity", "reflectance", "i")
 # Fewer points with more columns than this are points in columns.
 _MAX_COLUMNS = 12
+# No file has more.
+_MOST_COLUMNS = 1000
 # Largest intensities of common sensors and files.
 _SCALES = (1, 255, 65535)
 
@@ -115,11 +117,11 @@ def _column_names(columns: int | Sequence[str]) -> tuple[int, tuple[str, ...]]:
     """Return the number of columns and the names of all or the first four; raises InputError without x, y and z."""
     width, names = (columns, _COLUMNS[: max(columns, 0)]) if isinstance(columns, int) else (len(columns), columns)
     lower = [name.lower() for name in names]
-    if any(lower.count(name) != 1 for name in "xyz"):
+    if width > _MOST_COLUMNS or any(lower.count(name) != 1 for name in "xyz"):
         text = columns if isinstance(columns, int) else ",".join(columns)
         raise InputError(
             f"{text} does not give x, y and z one column each; "
-            "pass a number from 3, or names such as x,y,z,intensity,ring, as `columns`."
+            f"pass a number from 3 to {_MOST_COLUMNS}, or names such as x,y,z,intensity,ring, as `columns`."
         )
     return width, tuple(names)
 

@@ -86,10 +86,7 @@ def detect_dataset(
         with warnings.catch_warnings():
             # `describe_dropped` sums the same counts over all frames.
             warnings.filterwarnings("ignore", "Dropped ", DroppedWarning)
-            try:
-                result = detector(frame.points, frustum=frustum_of(frame.camera))
-            except InputError as error:
-                raise InputError(f"Frame {frame.name}: {error}") from error
+            result = detector(frame.points, frustum=frustum_of(frame.camera), source=f"Frame {frame.name}")
         scored.append(score_frame(frame, truth, result))
     if dropped := describe_dropped(scored):
         warnings.warn(dropped, DroppedWarning, stacklevel=2)

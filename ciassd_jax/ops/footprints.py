@@ -5,6 +5,7 @@ Every function works on JAX and NumPy arrays and keeps their float type; a mix o
 
 from __future__ import annotations
 
+import numpy as np
 from jaxtyping import Bool, Float
 
 from ciassd_jax.types import Array, Boxes
@@ -55,6 +56,8 @@ def footprints_collide(a: Boxes, b: Boxes) -> Bool[Array, "*n"]:
     return collide
 
 
+# A damaged coordinate may be near the largest float32.
+@np.errstate(over="ignore", invalid="ignore")
 def points_in_boxes(points: Float[Array, "P C"], boxes: Boxes) -> Bool[Array, "G P"]:
     """Return which of P points (x, y, z first) lie strictly inside which of G boxes.
 

@@ -21,6 +21,9 @@ def make_cloud(count: int = 5000, ground: float = -1.7) -> np.ndarray:
 def test_what_a_config_expects_gives_no_hint():
     assert describe_cloud(make_cloud(), LOW, HIGH, GROUND) == []
     assert describe_cloud(make_cloud(999, ground=5), LOW, HIGH, GROUND) == []
+    damaged = make_cloud()
+    damaged[0, :2] = 3e38
+    assert describe_cloud(damaged, LOW, HIGH, GROUND) == []
     # Points all around the sensor are half behind it.
     assert (
         describe_cloud(

@@ -92,7 +92,7 @@ def test_columns_are_parsed():
     assert parse_columns("x, y,z,intensity") == ("x", "y", "z", "intensity")
 
 
-@pytest.mark.parametrize("columns", [2, -1, (), ("x", "y", "i"), ("x", "x", "y", "z"), ("five",)])
+@pytest.mark.parametrize("columns", [2, -1, (), ("x", "y", "i"), ("x", "x", "y", "z"), ("five",), 10**20])
 def test_columns_need_x_y_and_z(tmp_path, columns):
     write_bin(tmp_path / "a.bin", POINTS)
     with pytest.raises(InputError, match=r"does not give x, y and z one column each; pass .* as `columns`\."):
@@ -292,3 +292,13 @@ def test_kitti_cloud(shared):
     assert len(points) > 100_000
     assert points[:, 3].min() >= 0
     assert points[:, 3].max() <= 1
+
+
+@pytest.mark.parametrize("storage", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_bytes_of_a_ply_are_fractions_of_255(tmp_path, storage):
+    order = ">" if "big" in storage else "<"
+    rows = np.array([(1, 2, 3, 0), (4, 5, 6, 51), (7, 8, 9, 255)], f"{order}f4,{order}f4,{order}f4,u1")
+    body = ascii_rows(np.array(rows.tolist(), int)) if storage == "ascii" else rows.tobytes()
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply(body, properties="float x,float y,float z,uchar intensity", storage=storage))
+    np.testing.assert_allclose(read_points(path)[:, 3], [0, 0.2, 1])

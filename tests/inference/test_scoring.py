@@ -37,7 +37,7 @@ class Oracle(Detector):
     def __init__(self, detect: Detect) -> None:
         self.config, self._find = CONFIG, detect
 
-    def __call__(self, points: Any, *, frustum: np.ndarray | None = None) -> FrameResult:
+    def __call__(self, points: Any, *, frustum: np.ndarray | None = None, source: str = "") -> FrameResult:
         boxes, labels = self._find(points)
         counts = {
             "points": {"given": len(points), "in_range": len(points), "dropped": 0, "invalid": 0},
@@ -220,6 +220,18 @@ def test_problems_of_frames_are_reported_once(tmp_path: Path) -> None:
     assert len(texts) == 2
     assert re.search(r"a\.npy has no intensity .* Other frames with this problem: 2\.$", texts[0])
     assert re.search(r"b\.npy: 1 of 980 points are not finite; they were left out\.$", texts[1])
+
+
+def test_the_detector_is_told_the_frame(tmp_path: Path) -> None:
+    sources = []
+
+    class Recorder(Oracle):
+        def __call__(self, points: Any, *, source: str = "", **others: Any) -> FrameResult:
+            sources.append(source)
+            return super().__call__(points, **others)
+
+    detect_dataset(Recorder(nothing), open_dataset(write_custom(tmp_path, names=("a", "b")), "all"))
+    assert sources == ["Frame a", "Frame b"]
 
 
 def test_other_warnings_are_left_alone(tmp_path: Path) -> None:

@@ -122,6 +122,13 @@ def test_faces_and_nan_are_outside():
     np.testing.assert_array_equal(points_in_boxes(jnp.asarray(points), jax.tree.map(jnp.asarray, box)), expected)
 
 
+def test_a_damaged_point_is_outside_without_a_warning():
+    points = np.array([[3e38, -3e38, 3e38], [0, 0, 0]], np.float32)
+    box = narrow(np.array([[0.0, 0.0, 0.0, 4.0, 2.0, 1.0, 0.3]]))
+    held = points_in_boxes(points, Boxes(*(np.asarray(leaf) for leaf in box)))
+    np.testing.assert_array_equal(held, [[False, True]])
+
+
 def test_a_mix_of_numpy_and_jax_gives_jax():
     rows = random_boxes(np.random.default_rng(4), 3)
     wide, single = Boxes.from_array(rows), narrow(rows)
