@@ -160,7 +160,8 @@ def crop_without_images(folder: Path, names: Sequence[str]) -> str | None:
         return None
     return (
         f"{describe_places(folder, IMAGES)} is missing for {guessed} of {len(names)} frames whose clouds are cropped "
-        "to the image; the usual size for the camera's focal length is used instead."
+        "to the image; give its size as `image_size` (width, height), or the usual one for the camera's focal length "
+        "is used."
     )
 
 

@@ -170,7 +170,8 @@ def test_a_missing_image_is_warned_of_once_where_clouds_are_cropped(tmp_path: Pa
         (root / f"training/image_2/{name}.png").unlink()
         (root / f"training/calib/{name}.txt").write_text(KITTI_CALIBRATION)
     message = (
-        r"NAME\.png or \.jpg or \.jpeg is missing for 2 of 3 frames whose clouds are cropped to the image; the usual"
+        r"NAME\.png or \.jpg or \.jpeg is missing for 2 of 3 frames whose clouds are cropped to the image; "
+        r"give its size as `image_size` \(width, height\), or the usual one"
     )
     with pytest.warns(FormatWarning, match=message):
         dataset = open_dataset(root, "all")
