@@ -12,6 +12,7 @@ from ciassd_jax.config import Config
 from ciassd_jax.data.cloud_hints import describe_cloud
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.formats.errors import InputError, collected_warnings, warn_of_file
+from ciassd_jax.formats.points import check_intensity
 from ciassd_jax.types import Boxes, GroundTruth, PointCloud, Scene
 
 OBSTACLE = -1
@@ -58,8 +59,8 @@ def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Ite
     """Return whether a target lies in the range of the grid; gives a FormatWarning if all lie outside.
 
     Gives another one if the first cloud is unlike what the config expects (`describe_cloud`). Reads up to the first
-    frame with a target. `track` wraps the iteration over the frames, for a progress bar. Raises InputError, which tells
-    what the labels have, if no object is of a class that is learned.
+    frame with a target. `track` wraps the iteration over the frames, for a progress bar. Raises InputError if the first
+    cloud has intensities of another scale, or, with what the labels have, if no object is of a class that is learned.
     """
     low, high = (np.array(limit) for limit in config.range)
     found: Counter[str] = Counter()
@@ -69,6 +70,7 @@ def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Ite
         with collected_warnings():
             frame = dataset.read(index)
         if index == 0:
+            check_intensity(frame.points, config.input.intensity_scale, f"Frame {frame.name}")
             for hint in describe_cloud(frame.points, *config.range, config.ground, config.input.z_shift):
                 warn_of_file(f"Frame {frame.name}: {hint}", stacklevel=2)
         of_class = target_labels(frame, config) >= 0

@@ -13,6 +13,7 @@ from mini_folders import NAMES, full_cloud, write_custom, write_kitti, write_spl
 from small import IMAGE_SIZE
 
 from ciassd_jax.cli import main
+from ciassd_jax.config import InputConfig
 from ciassd_jax.config.presets import tiny
 from ciassd_jax.data.folders import open_dataset
 from ciassd_jax.data.scenes import check_targets
@@ -233,6 +234,17 @@ def test_targets_out_of_range_are_told(tmp_path: Path) -> None:
     (root / "labels/a.txt").write_text("")
     with pytest.raises(InputError, match=r"^None of 1 frames has a labelled object; check the labels, or"):
         check_targets(open_dataset(root, "train"), tiny())
+
+
+def test_intensities_of_another_scale_are_refused_before_training(tmp_path: Path) -> None:
+    root = write_custom(tmp_path)
+    points = np.load(root / "points/a.npy")
+    points[:, 3] *= 200
+    np.save(root / "points/a.npy", points)
+    dataset = open_dataset(root, "train")
+    with pytest.raises(InputError, match=r"^Frame a has .* intensities outside \[0, 1\].* as `intensity_scale`"):
+        check_targets(dataset, tiny())
+    check_targets(dataset, replace(tiny(), input=InputConfig(intensity_scale=255.0)))
 
 
 def test_data_with_a_target_are_read_up_to_it(tmp_path: Path) -> None:
