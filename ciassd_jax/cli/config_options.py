@@ -7,6 +7,7 @@ and the number of classes and stages are those of the chosen config.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -122,12 +123,13 @@ class _Source:
 
 def take_fields(arguments: Sequence[str]) -> tuple[Replaced | None, list[str]]:
     """Parse the options --config.SECTION.FIELD; return the config with these fields, and the other arguments."""
-    names = [argument.partition("=")[0] for argument in arguments if argument.startswith("--config.")]
+    options = [_spelled(argument) for argument in arguments if argument.startswith("--")]
+    chosen = [option for option in options if option.startswith("--config") or option == "--preset"]
+    if repeated := next((option for option in chosen if chosen.count(option) > 1), None):
+        raise UsageError(f"{repeated} is given twice; give it once.")
+    names = [option.removeprefix("--config.") for option in chosen if option.startswith("--config.")]
     if not names:
         return None, list(arguments)
-    repeated = next((name for name in names if names.count(name) > 1), None)
-    if repeated:
-        raise UsageError(f"{repeated} is given twice; give it once.")
     fields, others = tyro.cli(
         _Fields,
         prog="ciassd",
@@ -138,8 +140,15 @@ def take_fields(arguments: Sequence[str]) -> tuple[Replaced | None, list[str]]:
     )
     unknown = next((argument for argument in others if argument.startswith("--config.")), None)
     if unknown:
-        raise UsageError(f"{unknown} is no field of this config; --help-config lists the fields.")
-    return Replaced(fields.config, tuple(name[9:].replace("-", "_") for name in names)), others
+        field, _, last = unknown.partition("=")[0].rpartition(".")
+        remedy = f"give all values of {field}, or see" if last.isdecimal() else "see"
+        raise UsageError(f"{unknown} is no field of this config; {remedy} the list of --help-config.")
+    return Replaced(fields.config, tuple(name.replace("-", "_") for name in names)), others
+
+
+def _spelled(argument: str) -> str:
+    """Return an option without its value, in one spelling whether it sets a switch or unsets it."""
+    return re.sub(r"\.no-(?=[^.]*$)", ".", argument.partition("=")[0].replace("_", "-"))
 
 
 def print_fields(arguments: Sequence[str]) -> None:

@@ -62,4 +62,5 @@ def _describe_classes(database: ObjectDatabase, config: Config) -> str:
     counts = {one.name: len(eligible_objects(database, one, difficulty_filter=strict)) for one in config.classes}
     found = ", ".join(f"{count} of class {name}" for name, count in counts.items())
     types = ", ".join(database.names) or "none"
-    return f"Training can sample {found}; the labels have the types {types}."
+    remedy = "" if any(counts.values()) else "; choose classes with `ciassd data suggest`"
+    return f"Training can sample {found}; the labels have the types {types}{remedy}."

@@ -15,6 +15,8 @@ _MIN_IN_RANGE = 0.1
 _NEAR, _STEP, _MIN_GROUND = 40.0, 0.2, 0.2
 # Hills and curbs move the ground of KITTI's frames by up to 0.4 m.
 _MAX_GAP = 0.5
+# A slope that falls away may have this share of the points below the ground near the sensor.
+_MAX_BELOW = 0.3
 
 
 def describe_cloud(
@@ -42,7 +44,9 @@ def describe_cloud(
             "save metres with x forward and z up, or change grid.minimum and grid.maximum."
         )
     height = _ground_height(coordinates, ground)
-    if height is not None and abs(height - ground) > _MAX_GAP:
+    if height is not None and (coordinates[:, 2] < height - _MAX_GAP).mean() > _MAX_BELOW:
+        hints.append("Many points lie below what seems to be the ground; save them with z up.")
+    elif height is not None and abs(height - ground) > _MAX_GAP:
         hints.append(
             f"The ground seems to be at z = {height:.2f} m, but the anchors stand at {ground:.2f} m; "
             f"pass {z_shift + ground - height:.2f} as `z_shift`."

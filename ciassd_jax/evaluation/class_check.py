@@ -20,6 +20,8 @@ from ciassd_jax.evaluation.summary import evaluate
 _WIDE, _LONG = 1 / 1.2, 1.5
 # Fewer objects have no typical shape and height.
 _FEW = 5
+# Edges of this length in metres are of another unit.
+_METRES = 60.0
 # Share of a class that may lie outside the range, and relative difference of a typical object and its anchor.
 _MAX_OUTSIDE, _MAX_DIFFERENCE = 0.1, 0.3
 
@@ -103,6 +105,7 @@ def check_classes(labels: Labels, config: Config) -> Iterator[Finding]:
         yield Finding("class", True, f"No object is of a class that is learned ({learned}), but {found}; {remedy}.")
     else:
         yield from _check_case(labels, label, config)
+        yield from _check_others(labels.types[label < 0], (label >= 0).sum(), config)
         for index, one in enumerate(config.classes):
             yield from _check_class(one, labels.places[label == index], labels.boxes[label == index], config)
 
@@ -140,6 +143,15 @@ def _check_case(labels: Labels, label: Int[np.ndarray, " G"], config: Config) ->
             yield Finding("case", False, f"{text} {config.class_names[label[mine[0]]]}, because case does not matter.")
 
 
+def _check_others(types: np.ndarray, learned: int, config: Config) -> Iterator[Finding]:
+    """Find a type that is not learned although it has more objects than the classes."""
+    for name, count in Counter(types.tolist()).most_common(1):
+        if count > learned:
+            text = f"{count} objects are of type {name}, but only {learned} of a class that is learned"
+            remedy = "learn it, or list it under `similar` of a class, if it is one of them"
+            yield Finding("class", False, f"{text} ({', '.join(config.class_names)}); {remedy}.")
+
+
 def _check_class(
     one: ClassConfig, places: np.ndarray, boxes: Float[np.ndarray, "G 7"], config: Config
 ) -> Iterator[Finding]:
@@ -158,6 +170,10 @@ def _check_class(
     if len(boxes) < _FEW:
         return
     typical = np.median(boxes, axis=0)
+    if typical[3:6].max() > _METRES:
+        text = f"objects of class {one.name} are typically {typical[3:6].max():g} m long"
+        yield Finding("anchor", True, f"{places[0]} and others: {text}; write metres.")
+        return
     # A footprint is the same whichever of its edges is called length. Anchors are matched by it alone.
     shape, anchor = np.sort(typical[3:5]), np.sort([one.length, one.width])
     if (np.maximum(shape / anchor, anchor / shape.clip(1e-9)) > 1 + _MAX_DIFFERENCE).any():

@@ -98,7 +98,7 @@ def _main_table(evaluation: Evaluation) -> str:
             for metric in METRICS
             if evaluation.curves.get((name, metric, limit)) is not None
         ]
-        lines += rows or [(name, "not evaluated, as no detection of it has what a metric needs")]
+        lines += rows or [(name, "not evaluated, as there is no detection of it, or none has what a metric needs")]
     return f"AP in percent by KITTI's rules, frames: {evaluation.num_frames}\n{_align(lines)}"
 
 
@@ -128,6 +128,8 @@ def _notes(evaluation: Evaluation) -> Iterable[str]:
     if evaluation.left_out:
         parts = (_phrase(counts) + f" of {name}" for name, counts in evaluation.left_out.items())
         yield f"Not evaluated: {', '.join(parts)}."
+    if unlabelled := [name for name in evaluation.limits if not _num_labels(evaluation, name)]:
+        yield f"There is no label of {', '.join(unlabelled)}, so the AP says nothing there."
     total, unboxed = evaluation.total, evaluation.without_image_box
     if not evaluation.has_camera:
         yield (
@@ -142,7 +144,7 @@ def _notes(evaluation: Evaluation) -> Iterable[str]:
     if evaluation.has_camera and all(
         evaluation.curves[name, "aos", limits[0]] is None for name, limits in evaluation.limits.items()
     ):
-        yield "Orientation (aos) is not evaluated, as a detection has alpha -10 or none is in the image."
+        yield "Orientation (aos) is not evaluated: there is no detection, one has alpha -10, or none is in the image."
     if not evaluation.by_points:
         yield "Nothing by number of points, as the points in the boxes are not known here."
     if min(_counts(evaluation), default=CURVE_POINTS) < CURVE_POINTS:
@@ -150,6 +152,12 @@ def _notes(evaluation: Evaluation) -> Iterable[str]:
             f"By the official rule n objects fill n points of the curve, so that fewer than {CURVE_POINTS} cannot "
             "reach 100 by R40."
         )
+
+
+def _num_labels(evaluation: Evaluation, name: str) -> int:
+    """Return the number of labels of a class at its easiest to meet level, 1 if it is not evaluated."""
+    curves = [curves for (of, *_), curves in evaluation.curves.items() if of == name and curves is not None]
+    return max((curve.num_truths for each in curves for curve in each), default=1)
 
 
 def _counts(evaluation: Evaluation) -> Iterable[int]:

@@ -16,18 +16,19 @@ from ciassd_jax.data.frames import Dataset
 from ciassd_jax.evaluation.active_sites import count_sites
 from ciassd_jax.evaluation.fitted_grid import boxes_held, fit_grid
 from ciassd_jax.formats.errors import InputError, collected_warnings
+from ciassd_jax.formats.points import fitting_scale
 from ciassd_jax.ops.footprints import points_in_boxes
 
 # Types that are never a class.
 _NO_CLASS = ("dontcare", "misc")
 # A class has at least this share of the objects and this number of them.
 _LEAST_SHARE, _LEAST_OBJECTS = 0.05, 5
+# Fewer objects do not tell the sizes of a class, and edges of this length in metres are of another unit.
+_FEW_OBJECTS, _METRES = 20, 60.0
 # Share of the frames that a capacity covers, and the quantile of the standard normal distribution for this share.
 _COVERED, _DEVIATIONS = 0.995, 2.6
 # Factor of the numbers of sites, for the rotations and scales of augmentation.
 _ROOM = 1.1
-# What a sensor may write for the intensity 1.
-_SCALES = (1.0, 255.0, 65535.0)
 
 
 class Suggestion(NamedTuple):
@@ -64,6 +65,8 @@ def suggest_config(
     names = np.array([name.lower() for frame in labels for name in frame.names], np.str_)
     boxes = np.concatenate([frame.boxes for frame in labels])
     own = {name: boxes[names == name.lower()] for name in _choose_types(types, classes)}
+    if (longest := float(np.median(np.concatenate([*own.values()])[:, 3:6].max(1)))) > _METRES:
+        raise InputError(f"The objects are typically {longest:g} m long; write labels and clouds in metres.")
     intensity = float(_covering([frame.intensity for frame in labels]))
     config = replace(
         base,
@@ -137,7 +140,7 @@ def _suggest_class(name: str, boxes: Float[np.ndarray, "G 7"], base: Config) -> 
 def _suggest_scale(intensity: float, base: Config) -> float:
     """Return the intensity to read as 1: the base config's if it serves, or else one that sensors use."""
     own = base.input.intensity_scale
-    return next((scale for scale in (own, *_SCALES) if intensity <= scale), own)
+    return own if intensity <= own else fitting_scale(intensity)
 
 
 def _with_capacities(
@@ -212,6 +215,11 @@ def _class_notes(config: Config, types: dict[str, int]) -> tuple[str, ...]:
         f"z = {c.center_z - config.input.z_shift:g} m."
         for c in config.classes
     ]
+    notes += [
+        f"Only {types[c.name]} objects of class {c.name}: its sizes and the range may not fit other frames."
+        for c in config.classes
+        if types[c.name] < _FEW_OBJECTS
+    ]
     if others := {name: count for name, count in types.items() if name not in config.class_names}:
         remedy = "name a type as `classes` to learn it, or under `similar` of a class to count it as that one"
         notes.append(f"Left out: {_listed(others)}; {remedy}.")
@@ -234,6 +242,4 @@ def _size_notes(config: Config, base: Config, own: dict[str, np.ndarray], frames
 
 def _scale_notes(config: Config, intensity: float) -> tuple[str, ...]:
     scale = config.input.intensity_scale
-    if intensity > scale:
-        return (f"Intensities reach {intensity:g}; pass the largest that is no outlier as `intensity_scale`.",)
     return () if scale == 1 else (f"Intensities reach {intensity:g}; {scale:g} is read as 1.",)

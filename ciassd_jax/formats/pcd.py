@@ -141,7 +141,7 @@ def _read_header(data: bytes, path: Pathlike) -> tuple[_Header, bytes]:
 
 def _parse_header(entries: dict[str, list[str]]) -> _Header:
     """Parse the entries; raises LookupError, TypeError or ValueError for a missing or invalid one."""
-    names = entries["FIELDS"]
+    names = entries["COLUMNS" if "COLUMNS" in entries else "FIELDS"]
     counts = [int(count) for count in entries.get("COUNT", ["1"] * len(names))]
     fields: list[_Field] = []
     stride = columns = 0

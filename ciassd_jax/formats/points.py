@@ -28,7 +28,7 @@ _MAX_COLUMNS = 12
 # No file has more.
 _MOST_COLUMNS = 1000
 # Largest intensities of common sensors and files.
-_SCALES = (1, 255, 65535)
+_SCALES = (1.0, 100.0, 255.0, 4095.0, 65535.0)
 
 NamedColumns = Sequence[tuple[str, np.ndarray]]
 
@@ -100,12 +100,17 @@ def check_intensity(
     return points, int(clipped.sum())
 
 
+def fitting_scale(largest: float) -> float:
+    """Return the scale of intensities that reach `largest`: a usual one of at most three times that, or `largest` itself."""
+    return next((scale for scale in _SCALES if largest <= scale <= 3 * largest), largest)
+
+
 def _intensity_fault(intensity: Float32[np.ndarray, " N"], scale: float) -> str:
     """Say how finite intensities lie outside [0, scale], and the remedy."""
     fault = f"outside [0, {scale:g}], from {intensity.min():g} to {intensity.max():g}"
     if (intensity < 0).mean() > 0.005:
         return f"{fault}; save them without negative numbers, or name their column as `columns`."
-    fit = next((one for one in _SCALES if (intensity > one).mean() <= 0.001), intensity.max())
+    fit = fitting_scale(float(np.quantile(intensity, 0.999, method="higher")))
     values, counts = np.unique(intensity, return_counts=True)
     if len(values) <= 128 and values[-1] < 256 and (values % 1 == 0).all() and counts.max() < 3 * counts.mean():
         rings = "if they are ring numbers, pass names such as x,y,z,ring,intensity as `columns`"

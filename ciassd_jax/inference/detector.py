@@ -119,10 +119,14 @@ def pad_to_bucket(points: np.ndarray) -> PointCloud:
     return PointCloud(padded, np.array([len(points)], np.int32))
 
 
+@np.errstate(over="ignore")
 def _check_shape(points: Array) -> np.ndarray:
     """Return points [N, 4] as float32."""
-    if points.ndim != 2 or points.shape[1] != 4:
-        raise ValueError(f"points have the shape {points.shape}; give [N, 4]: x, y, z in metres and intensity.")
+    if np.ndim(points) != 2 or np.shape(points)[1] != 4:
+        remedy = "transpose them" if np.ndim(points) == 2 and np.shape(points)[0] == 4 else "give [N, 4]"
+        raise ValueError(
+            f"points have the shape {np.shape(points)}; {remedy}: x, y, z in metres and intensity of each point."
+        )
     return np.asarray(points, np.float32)
 
 
@@ -148,5 +152,7 @@ def _warn_of_drops(counts: dict[str, Any]) -> None:
     ]
     if counts["candidates"]["dropped"]:
         lost.append(f"{counts['candidates']['dropped']} candidates beyond detection.max_candidates")
-    if lost:
+    if not points["given"]:
+        warnings.warn("The cloud has no points.", DroppedWarning, stacklevel=4)
+    elif lost:
         warnings.warn("Dropped " + "; ".join(lost) + ".", DroppedWarning, stacklevel=4)

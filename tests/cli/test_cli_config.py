@@ -13,10 +13,15 @@ from ciassd_jax import Config, car_lite, three_class, tiny
 PEOPLE = three_class()
 
 
+def _count_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("compiled_memory", "count_flops", "count_parameters"):
+        monkeypatch.setattr(f"ciassd_jax.inference.cost.{name}", lambda *arguments: {})
+
+
 @pytest.fixture
 def shown(run: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     """The config that `ciassd info` with these arguments shows."""
-    monkeypatch.setattr("ciassd_jax.inference.cost.compiled_memory", lambda config, points: {})
+    _count_nothing(monkeypatch)
 
     def call(*arguments: object) -> Config:
         result = run("info", *arguments, "--json")
@@ -64,11 +69,15 @@ def test_an_option_of_the_command_wins_over_the_config(shown: Any) -> None:
     [
         (
             ("--config.grid.bogus", "3"),
-            "--config.grid.bogus is no field of this config; --help-config lists the fields.",
+            "--config.grid.bogus is no field of this config; see the list of --help-config.",
         ),
         (("--config.classes.1.name", "Bus"), "--config.classes.1.name is no field of this config"),
         (("--z-shift", "1", "--config.input.z-shift", "1"), "--config.input.z-shift sets a field that another option"),
         (("--config.dtype", "bfloat16", "--config.dtype", "float32"), "--config.dtype is given twice; give it once."),
+        (("--config.grid.max_voxels", "5", "--config.grid.max-voxels=6"), "--config.grid.max-voxels is given twice"),
+        (("--config.head.predict-iou", "--config.head.no-predict-iou"), "--config.head.predict-iou is given twice"),
+        (("--preset", "tiny", "--preset", "car"), "--preset is given twice; give it once."),
+        (("--config.grid.maximum.0", "70.4"), "give all values of --config.grid.maximum, or see"),
         (("--preset", "tiny", "--config", "x.json"), "--preset and --config both choose a config; give one of them."),
         (("--config", "nowhere.json"), "nowhere.json does not exist; check the path."),
         (("--intensity-scale", "0"), "input.intensity_scale (--config.input.intensity-scale): 0.0 must be positive"),
@@ -107,7 +116,7 @@ def test_the_help_lists_the_fields_only_if_asked(run: Any, capsys: pytest.Captur
 
 
 def test_info_explains_the_grid(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ciassd_jax.inference.cost.compiled_memory", lambda config, points: {})
+    _count_nothing(monkeypatch)
     lines = json.loads(run("info", "--json").out)["grid"]
     assert lines[0] == "x: 0 to 70.4 m, 1408 voxels of 0.05 m; next valid maximum 69.6 or 71.2."
     assert lines[3] == "Layers along z: 41 -> 21 -> 11 -> 5 -> 2, with 64 channels each in the BEV map."

@@ -18,6 +18,11 @@ def make_cloud(count: int = 5000, ground: float = -1.7) -> np.ndarray:
     return np.stack([x, y, ground + 0.01 * x + rise, rng.random(count)], -1).astype(np.float32)
 
 
+def test_a_cloud_that_is_upside_down_is_told():
+    (hint,) = describe_cloud(make_cloud() * np.float32([1, 1, -1, 1]), LOW, HIGH, GROUND)
+    assert hint.endswith("save them with z up.")
+
+
 def test_what_a_config_expects_gives_no_hint():
     assert describe_cloud(make_cloud(), LOW, HIGH, GROUND) == []
     assert describe_cloud(make_cloud(999, ground=5), LOW, HIGH, GROUND) == []

@@ -115,7 +115,8 @@ def test_intensities_of_another_scale_are_refused_until_the_scale_is_given(detec
 
 @pytest.mark.parametrize("points", [np.zeros((0, 4), np.float32), np.full((9, 4), 500, np.float32) * [1, 1, 1, 0]])
 def test_nothing_in_range_gives_an_empty_result(detector: Detector, points: np.ndarray) -> None:
-    with pytest.warns(DroppedWarning, match=f"^Dropped all {len(points)} points, none of which is in range.$"):
+    told = "Dropped all 9 points, none of which is in range" if len(points) else "The cloud has no points"
+    with pytest.warns(DroppedWarning, match=f"^{told}.$"):
         result = detector(points)
     assert len(result) == 0
     assert result.boxes.shape == (0, 7)
@@ -131,6 +132,11 @@ def test_overflow_is_counted_and_named(detector: Detector) -> None:
     assert f"{counts['voxels']['dropped']} voxels beyond the 2048 that fit (grid.max_voxels), with " in message
     assert f"{counts['points']['dropped']} points" in message
     assert f"{counts['sites'][0]['dropped']} sites of backbone stage 1 beyond the 2048 that fit" in message
+
+
+def test_points_in_columns_are_to_be_transposed(detector: Detector) -> None:
+    with pytest.raises(ValueError, match=r"points have the shape \(4, 600\); transpose them"):
+        detector(small_cloud().T)
 
 
 @pytest.mark.parametrize("shape", [(5, 3), (4,), (1, 5, 4)])

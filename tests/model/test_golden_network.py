@@ -68,7 +68,7 @@ def result(shared: Path, frame: str):
     padded = np.zeros((1, 20000, 4), np.float32)
     padded[0, : len(points)] = points
     cloud = PointCloud(padded, np.array([len(points)], np.int32))
-    voxels = jax.jit(voxelize_batch, static_argnames="grid")(cloud, weights.config.grid)
+    voxels = jax.jit(voxelize_batch)(cloud, weights.config)
     output, kept = run(weights.variables, voxels)
     return cloud, voxels, output, kept["intermediates"]
 
