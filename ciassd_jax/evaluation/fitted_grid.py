@@ -32,8 +32,8 @@ def fit_grid(boxes: Float[np.ndarray, "G 7"], base: Config) -> GridConfig:
         return replace(grid, minimum=(0 - west, -half, low), maximum=(east, half, high))
     except ValueError as error:
         raise InputError(
-            f"The boxes reach from x = {-west:g} to {east:g} m and {half:g} m to the side, too far for voxels of {x:g} m; "
-            "leave out far ones, or choose a larger grid.voxel_size."
+            f"The boxes reach from x = {-west:g} to {east:g} m and {half:g} m to the side, too far for voxels of "
+            f"{x:g} m; leave out far ones, or choose a larger grid.voxel_size."
         ) from error
 
 

@@ -155,7 +155,7 @@ def _notes(evaluation: Evaluation) -> Iterable[str]:
 
 
 def _num_labels(evaluation: Evaluation, name: str) -> int:
-    """Return the number of labels of a class at its easiest to meet level, 1 if it is not evaluated."""
+    """Return the number of labels of a class that any level admits; 1 for a class that is not evaluated."""
     curves = [curves for (of, *_), curves in evaluation.curves.items() if of == name and curves is not None]
     return max((curve.num_truths for each in curves for curve in each), default=1)
 

@@ -101,7 +101,7 @@ def check_intensity(
 
 
 def fitting_scale(largest: float) -> float:
-    """Return the scale of intensities that reach `largest`: a usual one of at most three times that, or `largest` itself."""
+    """Return the scale of intensities that reach `largest`: a usual one of at most three times that, or itself."""
     return next((scale for scale in _SCALES if largest <= scale <= 3 * largest), largest)
 
 
