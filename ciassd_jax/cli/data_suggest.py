@@ -41,9 +41,12 @@ class Suggest:
         with warnings_as_lines(root):
             dataset = open_dataset(root, self.split, self.image_size, columns, need_labels=False)
             config, notes = suggest_config(dataset, base, classes=self.classes, track=frames_with_bar)
+        if self.config_options == ConfigOptions():
+            print("Based on the preset car; --preset car_lite is sized for a CPU.", file=sys.stderr)
         print(*map(describe, notes), sep="\n", file=sys.stderr)
         if self.out is None:
             print(config.to_json())
         else:
             write_text(self.out, config.to_json())
+            print(f"Wrote {self.out}.", file=sys.stderr)
         return 0

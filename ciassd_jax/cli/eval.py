@@ -47,8 +47,8 @@ class Text:
             write_text(self.json, format_json(evaluation))
         print(format_report(evaluation))
         if evaluation.left_out:
-            name = next(iter(evaluation.left_out))
-            print(f"\n--overlap {name}=0.5 evaluates {name}, at an overlap of 0.5.")
+            overlaps = " ".join(f"{name}=0.5" for name in evaluation.left_out)
+            print(f"\n--overlap {overlaps} evaluates them too, at an overlap of 0.5.")
         if self.json is not None:
             print(f"Wrote {self.json}.")
         return 0
@@ -99,7 +99,7 @@ class Evaluate:
     dtype: Unset[Dtype] = None
     """Compute type of the network; by default that of the weights."""
     score_threshold: Unset[float] = None
-    """Lowest class probability of a candidate."""
+    """Lowest class probability of a candidate. Scores are lower: the probability times the predicted IoU ** 4."""
     files: Annotated[
         Annotated[Text, tyro.conf.subcommand("txt")] | None,
         tyro.conf.arg(name="", help="Instead of a network:"),

@@ -41,7 +41,7 @@ class Predict:
     dtype: Unset[Dtype] = None
     """Compute type of the network."""
     score_threshold: Unset[float] = None
-    """Lowest class probability of a candidate."""
+    """Lowest class probability of a candidate. Scores are lower: the probability times the predicted IoU ** 4."""
 
     def run(self) -> int:
         clouds = find_clouds(

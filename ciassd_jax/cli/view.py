@@ -119,8 +119,12 @@ def _detect(detector: Detector, frame: ViewFrame) -> ViewFrame:
 
 
 def _check_intensity(frame: ViewFrame, scale: float) -> None:
-    """Refuse a cloud that a detector would refuse too."""
-    _, clipped = check_intensity(np.asarray(frame.points, np.float32), scale, frame.name)
+    """Warn of a cloud that a detector would refuse; the page does not show intensities."""
+    try:
+        _, clipped = check_intensity(np.asarray(frame.points, np.float32), scale, frame.name)
+    except InputError as error:
+        warn_of_file(f"A detector would refuse it: {error}", frame.name)
+        return
     if clipped:
         warn_of_file(f"{frame.name}: {clipped} intensities lie outside [0, {scale:g}].", frame.name)
 

@@ -47,6 +47,8 @@ from ciassd_jax.ops.footprints import points_in_boxes
 
 # Least fraction of the median number of points that a cloud should have.
 _SPARSE = 0.1
+# Share of the boxes that may lie where no point can be.
+_MAX_HIDDEN = 0.1
 # Points outside of all boxes that are kept of a frame, to find the ground.
 _SAMPLE = 500
 
@@ -177,6 +179,10 @@ def _check_split_files(root: Path) -> Iterator[Finding]:
             continue
         splits[path.stem] = set(names)
         yield from _check_names(names, source, folder, {"cloud": places["cloud"]}, names)
+    if is_custom(root) and "train" not in splits:
+        path = root / "ImageSets/train.txt"
+        text = f"{path} does not exist; list the frames to train on there, one per line, and others in val.txt."
+        yield Finding("split", False, text)
     shared = sorted(splits.get("train", set()) & splits.get("val", set()))
     if shared:
         text = f"{root / 'ImageSets'}: train.txt and val.txt share {len(shared)} frames, the first {shared[0]}"
@@ -268,7 +274,10 @@ def _check_empty(frames: Sequence[Checked]) -> Iterator[Finding]:
     total = sum(len(one.inside) for one in frames)
     for reason, places in hidden.items():
         text = f"{len(places)} of {total} boxes hold no point because they lie {reason}, the first {places[0]}"
-        yield Finding("hidden", False, f"{text}; remove these labels, as nothing can be learned from them.")
+        remedy = "remove these labels, as nothing can be learned from them"
+        if "camera" in reason:
+            remedy = f"{remedy}, or use the custom layout, whose clouds are not cropped"
+        yield Finding("hidden", len(places) > _MAX_HIDDEN * total, f"{text}; {remedy}.")
     yield from (Finding("no point", False, text) for text in others)
     if len(others) > total / 2:
         remedy = "check that labels, calibration and clouds belong together, and the axes of the boxes."

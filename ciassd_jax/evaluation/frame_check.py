@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.evaluation.overlap import image_overlap
@@ -91,6 +91,14 @@ def project_rows(frame: Frame) -> list[tuple[ObjectRow, ObjectRow | None]]:
     return [(row, seen.get(index)) for index, row in enumerate(rows)]
 
 
+def in_view(frame: Frame) -> Bool[np.ndarray, " G"]:
+    """Return which objects have a corner that the camera sees; without a camera all of them."""
+    if frame.camera is None:
+        return np.ones(len(frame.names), bool)
+    corners = np.asarray(box_corners(frame.boxes))
+    return np.asarray(inside_planes(corners, view_planes(frame.camera)).any(1))
+
+
 def explain_empty(frame: Frame, inside: Int[np.ndarray, " G"]) -> dict[int, str]:
     """Return why an object that holds no point cannot hold any, by its index, where the frame tells."""
     empty = np.flatnonzero(inside == 0)
@@ -103,8 +111,7 @@ def explain_empty(frame: Frame, inside: Int[np.ndarray, " G"]) -> dict[int, str]
     reasons[(far.min(1) > distance.max())] = "beyond the farthest point"
     reasons[(low.max(1) < elevation.min()) | (far.max(1) < distance.min())] = "in the sensor's blind zone"
     if frame.camera is not None:
-        seen = inside_planes(corners, view_planes(frame.camera)).any(1)
-        reasons[~seen] = "outside the camera's view, to which clouds are cropped"
+        reasons[~in_view(frame)[empty]] = "outside the camera's view, to which clouds are cropped"
     else:
         start, size = _largest_gap(azimuth)
         hidden = (((side - start) % (2 * math.pi)) < size).all(1) & (size > _MIN_GAP)

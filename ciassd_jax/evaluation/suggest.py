@@ -15,6 +15,7 @@ from ciassd_jax.config import ClassConfig, Config
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.evaluation.active_sites import count_sites
 from ciassd_jax.evaluation.fitted_grid import boxes_held, fit_grid
+from ciassd_jax.evaluation.frame_check import in_view
 from ciassd_jax.formats.errors import InputError, collected_warnings
 from ciassd_jax.formats.points import fitting_scale
 from ciassd_jax.ops.footprints import points_in_boxes
@@ -82,10 +83,10 @@ def suggest_config(
 
 
 def _read_labels(dataset: Dataset, index: int) -> _Labels:
-    """Read a frame; objects without a volume are left out."""
+    """Read a frame; objects without a volume and those that its camera cannot see are left out."""
     frame = dataset.read(index)
     boxes = np.asarray(frame.boxes.to_array())
-    usable = np.asarray((boxes[:, 3:6] > 0).all(-1))
+    usable = np.asarray((boxes[:, 3:6] > 0).all(-1)) & in_view(frame)
     names = tuple(name for name, use in zip(frame.names, usable, strict=True) if use)
     intensity = np.quantile(frame.points[:, 3], 0.99, method="higher") if len(frame.points) else 0
     return _Labels(names, boxes[usable], float(intensity))

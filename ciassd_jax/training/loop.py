@@ -247,7 +247,7 @@ class _Run:
         numbers = score_weights(self.state, self.validation, self.config, self.folder / "eval" / str(step))
         score, best = numbers["score"], self.best
         self.metrics.write(step, numbers)
-        self.log(f"step {step}  " + "  ".join(f"{name} {value:.2f}" for name, value in numbers.items()))
+        self.log(f"step {step}  " + "  ".join(f"{name} {round(value, 2):g}" for name, value in numbers.items()))
         if best is None or score > best:
             self._export(_BEST)
         return score

@@ -13,6 +13,7 @@ from ciassd_jax.evaluation import Evaluation, format_json, format_report, limits
 from ciassd_jax.evaluation.kitti_ap import Metric, Recall
 from ciassd_jax.formats.errors import Pathlike
 from ciassd_jax.formats.kitti_camera import frustum_of
+from ciassd_jax.formats.kitti_rows import DIFFICULTIES
 from ciassd_jax.formats.writing import write_text
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.scoring import detect_dataset, score_frames, write_frames
@@ -23,31 +24,37 @@ from ciassd_jax.types import Boxes, Variables
 def score_weights(
     state_or_variables: Variables, dataset: Dataset, config: Config, folder: Pathlike
 ) -> dict[str, float]:
-    """Return `precisions` of the weights; write result.json, table.txt and data/NAME.txt per frame to `folder`."""
+    """Return `precisions` of the weights and the number of their detections.
+
+    Writes result.json, table.txt and data/NAME.txt per frame to `folder`.
+    """
     frames = detect_dataset(Detector(state_or_variables, config), dataset)
     evaluation = score_frames(frames, config)
     folder = Path(folder)
     write_frames(frames, folder / "data")
     write_text(folder / "result.json", format_json(evaluation))
     write_text(folder / "table.txt", format_report(evaluation))
-    return precisions(evaluation, config)
+    return precisions(evaluation, config) | {"detections": sum(len(frame.result) for frame in frames)}
 
 
 def precisions(evaluation: Evaluation, config: Config) -> dict[str, float]:
-    """Return AP R40 moderate in percent, in 3D and BEV at the limits of every class, after "score".
+    """Return AP R40 in percent, in 3D and BEV at the limits of every class, after "score".
 
-    The score is the mean over the classes in 3D at the strict limit. AP is 0 if nothing was detected, where KITTI's
-    program prints nothing.
+    The score is the mean over the classes in 3D at the strict limit. The level is moderate by KITTI's difficulty, and
+    hard, which has all but the emptiest objects, where the number of points is the difficulty. AP is 0 if nothing was
+    detected, where KITTI's program prints nothing.
     """
-    limits = limits_of(config)
+    limits, level = limits_of(config), 1 if evaluation.difficulty == "kitti" else 2
     metrics: tuple[Metric, ...] = ("3d", "bev")
     numbers = {
-        f"{name}_{metric}_{limit:.2f}_moderate_R40": precision_of(evaluation, name, metric, limit)
+        f"{name}_{metric}_{limit:.2f}_{DIFFICULTIES[level].name}_R40": precision_of(
+            evaluation, name, metric, limit, level=level
+        )
         for name, of_class in limits.items()
         for metric in metrics
         for limit in of_class
     }
-    strict = [precision_of(evaluation, name, "3d", of_class[0]) for name, of_class in limits.items()]
+    strict = [precision_of(evaluation, name, "3d", of_class[0], level=level) for name, of_class in limits.items()]
     return {"score": sum(strict) / len(strict)} | numbers
 
 

@@ -87,7 +87,7 @@ def test_a_class_of_ones_own(folders: tuple[Path, Path], capsys: pytest.CaptureF
     assert main(arguments) == 0
     shown = capsys.readouterr().out
     assert "\nNot evaluated: 2 labels and 2 detections of Vehicle.\n" in shown
-    advice = re.search(r"^(--overlap Vehicle=\S+) evaluates Vehicle", shown, re.MULTILINE)[1]
+    advice = re.search(r"^(--overlap Vehicle=\S+) evaluates them", shown, re.MULTILINE)[1]
     assert main([*arguments, *advice.split(), "Forklift=.4", "--overlap", "car=0.6"]) == 0
     shown = capsys.readouterr().out
     assert "Vehicle AP@0.50, 0.50, 0.50:\nbbox AP:9.0909, 9.0909, 9.0909\n" in shown

@@ -30,24 +30,24 @@ def test_every_class_has_its_numbers_and_the_score_is_their_mean() -> None:
     numbers = precisions(an_evaluation(CONFIG, {"car": 41, "Forklift": 20}), CONFIG)
     assert next(iter(numbers)) == "score"
     assert list(numbers)[1:] == [
-        "Car_3d_0.70_moderate_R40",
-        "Car_3d_0.50_moderate_R40",
-        "Car_bev_0.70_moderate_R40",
-        "Car_bev_0.50_moderate_R40",
-        "Forklift_3d_0.40_moderate_R40",
-        "Forklift_bev_0.40_moderate_R40",
+        "Car_3d_0.70_hard_R40",
+        "Car_3d_0.50_hard_R40",
+        "Car_bev_0.70_hard_R40",
+        "Car_bev_0.50_hard_R40",
+        "Forklift_3d_0.40_hard_R40",
+        "Forklift_bev_0.40_hard_R40",
     ]
-    assert numbers["Car_3d_0.70_moderate_R40"] == pytest.approx(100)
-    assert 40 < numbers["Forklift_3d_0.40_moderate_R40"] < 60
-    assert numbers["score"] == pytest.approx((100 + numbers["Forklift_3d_0.40_moderate_R40"]) / 2)
+    assert numbers["Car_3d_0.70_hard_R40"] == pytest.approx(100)
+    assert 40 < numbers["Forklift_3d_0.40_hard_R40"] < 60
+    assert numbers["score"] == pytest.approx((100 + numbers["Forklift_3d_0.40_hard_R40"]) / 2)
 
 
 def test_a_class_without_detections_counts_as_0() -> None:
     numbers = precisions(an_evaluation(CONFIG, {"Car": 41, "Forklift": 0}), CONFIG)
-    assert numbers["Forklift_3d_0.40_moderate_R40"] == 0
+    assert numbers["Forklift_3d_0.40_hard_R40"] == 0
     assert numbers["score"] == pytest.approx(50)
 
 
 def test_with_cars_only_the_score_is_theirs() -> None:
     numbers = precisions(an_evaluation(car(), {"Car": 30}), car())
-    assert numbers["score"] == numbers["Car_3d_0.70_moderate_R40"] > 0
+    assert numbers["score"] == numbers["Car_3d_0.70_hard_R40"] > 0
