@@ -208,6 +208,7 @@ def test_a_suggested_config_is_checked_without_findings_and_has_positives(tmp_pa
     assert set(np.asarray(targets.truth)[np.asarray(targets.label) == 1].tolist()) == {0, 1, 2}
 
 
+@pytest.mark.slow
 @pytest.mark.reference
 def test_a_config_for_real_cars(shared: Path) -> None:
     dataset = open_dataset(shared / "kitti", "all")

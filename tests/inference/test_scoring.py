@@ -280,6 +280,7 @@ def test_real_frames_evaluate_like_their_files(shared: Path, tmp_path: Path) -> 
     assert_same_precision(evaluation, written(frames, shared / "kitti/training/label_2", tmp_path), ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.reference
 def test_golden_weights_on_real_frames(shared: Path, tmp_path: Path) -> None:
     weights = load_weights(shared / "golden/weights.pth")

@@ -202,6 +202,7 @@ def test_backends_agree(variables):
     assert_close(run(variables, cloud, TINY), run(variables, cloud, dense(TINY)))
 
 
+@pytest.mark.slow
 def test_backends_agree_in_training(variables):
     """Of the backbone, where alone they differ: the map, the statistics and the gradients by all parameters."""
     voxels = small_voxels(300, ROWS)

@@ -126,6 +126,7 @@ def test_the_weights_are_those_of_the_last_step(whole: tuple[Fitted, Path, list[
     assert_same_bits(saved_state(workdir), fitted.state)
 
 
+@pytest.mark.slow
 def test_validates_on_synthetic_frames(tmp_path: Path) -> None:
     frames = open_synthetic(seed=3, frames=2, lidar=Lidar(columns=128))
     batches = make_batches(frames, mini_config(), seed=3, batch_size=2)
