@@ -10,15 +10,12 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import DroppedWarning, FormatWarning
 
 Item = TypeVar("Item")
-# The fields of a config in messages: "section.field", with an index for those of a class or a stage.
-_SECTIONS = {one.name for one in dataclasses.fields(Config)}
-_FIELD = re.compile(rf"(?<![\w./-])({'|'.join(sorted(_SECTIONS))})((?:\[\d+\]|\.\w+)+)")
 # How the library's messages name what the program has an option or a command for.
 _OPTIONS = {
     "as `image_size` (width, height)": "with --image-size WIDTH HEIGHT",
@@ -30,6 +27,20 @@ _OPTIONS = {
     "`overwrite`": "--overwrite",
     "`write_synthetic`": "`ciassd data synth`",
 }
+
+
+def _field_patterns(kind: Any) -> Iterator[str]:
+    """Yield a pattern for each field of a config, as messages name it: "grid.max_voxels", "classes[0].name"."""
+    for name, hint in get_type_hints(kind).items():
+        section = next((one for one in (hint, *get_args(hint)) if dataclasses.is_dataclass(one)), None)
+        if section is None:
+            yield name
+        else:
+            place = name if section is hint else rf"{name}\[\d+\]"
+            yield from (rf"{place}\.{field}" for field in _field_patterns(section))
+
+
+_FIELD = re.compile(rf"(?<![\w./-])(?:{'|'.join(one for one in _field_patterns(Config) if '.' in one)})\b")
 
 
 class UsageError(ValueError):

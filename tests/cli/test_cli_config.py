@@ -9,6 +9,7 @@ import pytest
 from small import small_config
 
 from ciassd_jax import Config, car_lite, three_class, tiny
+from ciassd_jax.cli.messages import describe
 
 PEOPLE = three_class()
 
@@ -137,3 +138,18 @@ def test_an_invalid_grid_names_the_option_and_a_value_that_works(
     assert left.value.code == 2
     assert "grid.maximum along x" in capsys.readouterr().err
     assert shown("--config.grid.maximum", 69.6, 40, 1).grid.maximum == (69.6, 40.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("message", "shown"),
+    [
+        ("raise grid.max_voxels.", "raise grid.max_voxels (--config.grid.max-voxels)."),
+        ("classes[1].name: bad", "classes[1].name (--config.classes.1.name): bad"),
+        ("backbone.stages[2].capacity is", "backbone.stages[2].capacity (--config.backbone.stages.2.capacity) is"),
+        ("data.augmentation.flip_probability:", "data.augmentation.flip_probability "),
+        ("data.bin is empty; data/grid.minimum too.", "data.bin is empty; data/grid.minimum too."),
+        ("pass 5 as `columns`, or 255 as `intensity_scale`", "pass 5 with --columns, or 255 with --intensity-scale"),
+    ],
+)
+def test_messages_name_the_options(message: str, shown: str) -> None:
+    assert describe(message).startswith(shown)
