@@ -143,6 +143,9 @@ def take_fields(arguments: Sequence[str]) -> tuple[Replaced | None, list[str]]:
         field, _, last = unknown.partition("=")[0].rpartition(".")
         remedy = f"give all values of {field}, or see" if last.isdecimal() else "see"
         raise UsageError(f"{unknown} is no field of this config; {remedy} the list of --help-config.")
+    paths = [name for one in fields.config.classes for name in one.similar if Path(name).exists()]
+    if paths and any(name.endswith(".similar") for name in names):
+        raise UsageError(f"{paths[0]} was taken for a similar class; give the path before the options.")
     return Replaced(fields.config, tuple(name.replace("-", "_") for name in names)), others
 
 

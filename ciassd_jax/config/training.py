@@ -29,11 +29,11 @@ class AugmentationConfig:
 
     def __post_init__(self) -> None:
         if not 0 <= self.flip_probability <= 1:
-            raise ValueError(f"augmentation.flip_probability: {self.flip_probability} is outside [0, 1].")
+            raise ValueError(f"data.augmentation.flip_probability: {self.flip_probability} is outside [0, 1].")
         if not 0 < self.min_scale <= self.max_scale:
-            raise ValueError("augmentation: scales must satisfy 0 < min_scale <= max_scale.")
+            raise ValueError("data.augmentation: scales must satisfy 0 < min_scale <= max_scale.")
         if min(self.max_rotation, self.noise_rotation, *self.noise_shift) < 0 or self.noise_tries < 1:
-            raise ValueError("augmentation: rotations and shifts must be at least 0, noise_tries at least 1.")
+            raise ValueError("data.augmentation: rotations and shifts must be at least 0, noise_tries at least 1.")
 
 
 @dataclass(frozen=True)

@@ -92,6 +92,14 @@ def test_what_cannot_be_used_is_one_sentence(run: Any, arguments: tuple[str, ...
     assert result.err.count("\n") == 1
 
 
+def test_a_path_after_names_is_told_and_the_remedy_works(run: Any, shown: Any, tmp_path: Path) -> None:
+    names = ("--config.classes.0.similar", "Van", "Truck")
+    result = run("data", "check", *names, tmp_path)
+    assert result.code == 2
+    assert result.err == f"error: {tmp_path} was taken for a similar class; give the path before the options.\n"
+    assert f"{tmp_path} has no folder" in run("data", "check", tmp_path, *names).err
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"grid": {"bogus": 1}}'])
 def test_a_file_that_is_no_config_is_one_sentence(run: Any, tmp_path: Path, text: str) -> None:
     (tmp_path / "config.json").write_text(text)
