@@ -79,24 +79,26 @@ def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Ite
             return True
         learned += int(of_class.sum())
         found.update(frame.names)
-    names = ", ".join(config.class_names)
-    if learned:
-        space = ", ".join(f"{axis} {least:g}..{most:g}" for axis, least, most in zip("xyz", low, high, strict=True))
-        warn_of_file(
-            f"All {learned} objects of the classes that are learned ({names}) lie outside the grid, {space} m; choose "
-            "a range with `ciassd data suggest`."
-        )
-        return False
+    if not learned:
+        raise InputError(_describe_types(found, len(dataset), config))
+    space = ", ".join(f"{axis} {least:g}..{most:g}" for axis, least, most in zip("xyz", low, high, strict=True))
+    warn_of_file(
+        f"All {learned} objects of the classes that are learned ({', '.join(config.class_names)}) lie outside the grid, "
+        f"{space} m; choose a range with `ciassd data suggest`."
+    )
+    return False
+
+
+def _describe_types(found: Counter[str], frames: int, config: Config) -> str:
+    """Say which types there are instead of those that are learned, and the remedy."""
     if not found:
-        raise InputError(
-            f"None of {len(dataset)} frames has a labelled object; check the labels, or choose another split."
-        )
+        return f"None of {frames} frames has a labelled object; check the labels, or choose another split."
     types = ", ".join(f"{name} ({count})" for name, count in found.most_common())
     graded = " with a difficulty" if config.data.augmentation.filter_scenes else ""
-    raise InputError(
-        f"None of {found.total()} labelled objects in {len(dataset)} frames is of a class that is learned "
-        f"({names}){graded}; the labels have {types}, so choose classes with `ciassd data suggest`, or "
-        "list a type as `similar` of a class."
+    return (
+        f"None of {found.total()} labelled objects in {frames} frames is of a class that is learned "
+        f"({', '.join(config.class_names)}){graded}; the labels have {types}, so choose classes with "
+        "`ciassd data suggest`, or list a type as `similar` of a class."
     )
 
 
