@@ -83,8 +83,8 @@ def check_targets(dataset: Dataset, config: Config, track: Callable[[range], Ite
         raise InputError(_describe_types(found, len(dataset), config))
     space = ", ".join(f"{axis} {least:g}..{most:g}" for axis, least, most in zip("xyz", low, high, strict=True))
     warn_of_file(
-        f"All {learned} objects of the classes that are learned ({', '.join(config.class_names)}) lie outside the grid, "
-        f"{space} m; choose a range with `ciassd data suggest`."
+        f"All {learned} objects of the classes that are learned ({', '.join(config.class_names)}) lie outside the "
+        f"grid, {space} m; choose a range with `ciassd data suggest`."
     )
     return False
 
