@@ -6,6 +6,7 @@ import os
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, overload
 
@@ -41,10 +42,17 @@ class Detector:
         self._is_first = True
 
     @classmethod
-    def from_pretrained(cls, path_or_name: str | os.PathLike[str]) -> Detector:
-        """Load a weights file (.safetensors, or a released .pth), or bundled weights by name."""
+    def from_pretrained(
+        cls, path_or_name: str | os.PathLike[str], *, intensity_scale: float | None = None, z_shift: float | None = None
+    ) -> Detector:
+        """Load a weights file (.safetensors, or a released .pth), or bundled weights by name.
+
+        `intensity_scale` and `z_shift` replace those of `config.input`, for clouds of another sensor.
+        """
         weights = load_weights(find_weights(path_or_name))
-        return cls(weights.variables, weights.config)
+        given = {"intensity_scale": intensity_scale, "z_shift": z_shift}
+        changed = {name: float(value) for name, value in given.items() if value is not None}
+        return cls(weights.variables, replace(weights.config, input=replace(weights.config.input, **changed)))
 
     @overload
     def __call__(self, points: Array, *, frustum: np.ndarray | None = None, source: Pathlike = ...) -> FrameResult: ...

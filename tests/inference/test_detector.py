@@ -102,14 +102,16 @@ def test_a_single_intensity_out_of_range_is_clipped_and_named(detector: Detector
 
 
 @pytest.mark.usefixtures("quiet")
-def test_intensities_of_another_scale_are_refused_until_the_scale_is_given(detector: Detector) -> None:
+def test_intensities_of_another_scale_are_refused_until_the_scale_is_given(detector: Detector, tmp_path: Path) -> None:
     byte = np.round(small_cloud() * 64) / 64 * np.float32([1, 1, 1, 256])
     with pytest.raises(
         InputError, match=r"^The cloud has 9\d\.\d % of its intensities .*; pass .* as `intensity_scale`"
     ):
         detector(byte)
-    config = replace(small_config(), input=InputConfig(intensity_scale=256.0))
-    result = Detector(random_variables(small_config()), config)(byte)
+    save_weights(tmp_path / "small.safetensors", random_variables(small_config()), small_config())
+    of_bytes = Detector.from_pretrained(tmp_path / "small.safetensors", intensity_scale=256.0)
+    assert of_bytes.config.input == InputConfig(intensity_scale=256.0)
+    result = of_bytes(byte)
     np.testing.assert_array_equal(result.boxes, detector(byte / np.float32([1, 1, 1, 256])).boxes)
 
 
