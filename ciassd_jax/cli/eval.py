@@ -155,4 +155,4 @@ class Evaluate:
 def _with_bar(names: Sequence[str]) -> Iterable[str]:
     from tqdm.auto import tqdm
 
-    return tqdm(names, unit="frame")
+    return tqdm(names, unit="frame", disable=None)

@@ -71,7 +71,7 @@ class Predict:
         from tqdm.auto import tqdm
 
         boxes, seconds, cropped = 0, 0.0, 0
-        with tqdm(clouds, unit="frame") as bar:
+        with tqdm(clouds, unit="frame", disable=None) as bar:
             for cloud in bar:
                 result, _, outside = self._cloud(detector, cloud)
                 best = f"best {result.scores.max():.2f}" if len(result) else "none"
