@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
-from ciassd_jax.cli.messages import UsageError, warnings_as_lines
+from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
 from ciassd_jax.cli.options import Dtype, Frames, Unset
 from ciassd_jax.evaluation import LIMITS, Evaluation, Limits, evaluate, format_json, format_report, read_folders
 from ciassd_jax.formats.writing import check_folder, write_text
@@ -121,7 +121,7 @@ class Evaluate:
                 check_folder(out)
         with warnings_as_lines(folder or "simulated frames"):
             dataset = self.data_set.open(self.split, self.seed)
-            frames = detect_dataset(Detector(weights.variables, weights.config), dataset, _with_bar)
+            frames = detect_dataset(Detector(weights.variables, weights.config), dataset, frames_with_bar)
         evaluation = score_frames(frames, weights.config)
         print(format_report(evaluation))
         boxes, seconds = sum(len(frame.lines) for frame in frames), sum(frame.result.seconds for frame in frames)
@@ -150,9 +150,3 @@ class Evaluate:
         written = [str(path) for path in (self.out, self.json) if path is not None]
         if written:
             print(f"Wrote {' and '.join(written)}.")
-
-
-def _with_bar(names: Sequence[str]) -> Iterable[str]:
-    from tqdm.auto import tqdm
-
-    return tqdm(names, unit="frame", disable=None)

@@ -146,8 +146,8 @@ def test_a_network_is_evaluated_and_its_files_evaluate_alike(work: Path, capsys:
     weights = work / "run/last.safetensors"
     assert main(["eval", "--weights", str(weights), "--data", str(work / "kitti"), "--out", str(out)]) == 0
     shown, said = capsys.readouterr()
-    assert re.sub(r".*\r", "", said).count("\n") == 1
-    assert "2/2" in said
+    # Only a terminal shows a progress bar.
+    assert said == ""
     *table, counts, done = shown.splitlines()
     assert re.fullmatch(r"2 frames, \d+ boxes, \d+ ms per frame without reading and compilation\.", counts)
     assert done == f"Wrote {out}."
