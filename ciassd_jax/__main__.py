@@ -2,27 +2,24 @@
 
 import os
 import sys
-from pathlib import Path
-
-import jax
 
 from ciassd_jax.cli import main
-
-
-def keep_programs() -> None:
-    """Use a persistent compilation cache, ~/.cache/ciassd_jax, so that later runs skip the compilation.
-
-    JAX_COMPILATION_CACHE_DIR sets another folder; JAX_ENABLE_COMPILATION_CACHE=false disables the cache.
-    """
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(cache / "ciassd_jax"))
+from ciassd_jax.inference.programs import keep_programs
 
 
 def program() -> int:
     """Run `ciassd` with the compilation cache and return its exit code."""
     keep_programs()
-    return main()
+    try:
+        code = main()
+    except KeyboardInterrupt:
+        code = 130
+    if code >= 128:
+        # A signal ended the command. The compiler may still run in its thread; a normal exit would wait for it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    return code
 
 
 if __name__ == "__main__":

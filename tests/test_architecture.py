@@ -26,7 +26,7 @@ BELOW = {
 BELOW["training"] = BELOW["inference"] | {"inference"}
 BELOW["cli"] = BELOW["training"] | {"training"}
 BELOW["__init__"] = BELOW["training"] | {"training"}
-BELOW["__main__"] = {"cli"}
+BELOW["__main__"] = {"cli", "inference"}
 # Imported where they are used, never at the top of a module, but for tyro in the commands.
 LAZY = {"grain", "orbax", "tyro", "tqdm", "matplotlib", "plotly", "PIL", "tensorboardX", "absl", "torch", "spconv"}
 # All that `import ciassd_jax` may need; chex brings absl.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from math import prod
 from typing import Any
 
@@ -11,14 +10,14 @@ import jax
 from ciassd_jax.config import Config
 from ciassd_jax.inference.detector import bucket_of
 from ciassd_jax.inference.predict import compile_predict
-from ciassd_jax.model.network import init_variables
+from ciassd_jax.model.network import variable_shapes
 
 PARTS = ("backbone", "neck", "head")
 
 
 def count_parameters(config: Config) -> dict[str, int]:
     """Return the number of trainable parameters of each part and in total."""
-    params = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))["params"]
+    params = variable_shapes(config)["params"]
     counts = {part: sum(prod(leaf.shape) for leaf in jax.tree.leaves(params[part])) for part in PARTS}
     return counts | {"total": sum(counts.values())}
 
@@ -28,7 +27,7 @@ def count_flops(config: Config) -> dict[str, int]:
 
     A multiply-add counts as two. The backbone is counted at full capacity; a scene with fewer sites costs less.
     """
-    params = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))["params"]
+    params = variable_shapes(config)["params"]
     cells = prod(config.bev_shape)
     counts = dict.fromkeys(PARTS, 0)
     for part in PARTS:

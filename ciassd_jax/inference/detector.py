@@ -91,7 +91,7 @@ class Detector:
         batch = jax.device_get(program(self._variables, pad_to_bucket(points), frustum=planes[None]))
         seconds = time.perf_counter() - start
         changed = {"clipped": clipped, "invalid": self._count_invalid(points)}
-        result = frame_result(batch, self.config, seconds, changed)
+        result = frame_result(batch, 0, self.config.class_names, seconds, changed)
         _warn_of_drops(result.counts)
         return result
 

@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from ciassd_jax.config import Config
 from ciassd_jax.inference.postprocess import postprocess
-from ciassd_jax.model.network import init_variables, predict_raw
+from ciassd_jax.inference.programs import compile_program
+from ciassd_jax.model.network import predict_raw, variable_shapes
 from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.types import Array, Detections, PointCloud, Variables
 
@@ -33,11 +34,18 @@ def predict(
 
 
 @lru_cache
-def compile_predict(config: Config, num_points: int) -> jax.stages.Compiled:
-    """Compile `predict` for one cloud [1, num_points, 4] with a frustum: a function of (variables, cloud, frustum=...).
+def compile_predict(config: Config, num_points: int, batch: int = 1) -> jax.stages.Compiled:
+    """Compile `predict` for clouds [batch, num_points, 4] with frustums: a function of (variables, cloud, frustum=...).
 
     Programs are kept and shared by all callers of an equal config; pass `config.for_inference()`.
     """
-    variables = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
-    cloud = PointCloud(np.zeros((1, num_points, 4), np.float32), np.zeros(1, np.int32))
-    return jax.jit(partial(predict, config=config)).lower(variables, cloud, frustum=ANYWHERE[None]).compile()
+    variables = variable_shapes(config)
+    cloud = PointCloud(np.zeros((batch, num_points, 4), np.float32), np.zeros(batch, np.int32))
+    scenes = "1 scene" if batch == 1 else f"{batch} scenes"
+    return compile_program(
+        jax.jit(partial(predict, config=config)),
+        variables,
+        cloud,
+        frustum=np.broadcast_to(ANYWHERE, (batch, *ANYWHERE.shape)),
+        what=f"predict for {scenes} of {num_points} points",
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,6 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import Pathlike
 from ciassd_jax.formats.kitti_boxes import boxes_to_rows
 from ciassd_jax.formats.kitti_camera import Camera
@@ -90,14 +90,16 @@ class FrameResult:
         }
 
 
-def frame_result(batch: Detections, config: Config, seconds: float, changed: dict[str, int]) -> FrameResult:
-    """Return the detections of a batch of one scene, which took `seconds`, as NumPy arrays.
+def frame_result(
+    batch: Detections, index: int, class_names: Sequence[str], seconds: float, changed: dict[str, int]
+) -> FrameResult:
+    """Return the detections of scene `index` of a batch, which took `seconds`, as NumPy arrays.
 
     `changed` are the numbers of its points that were changed or dropped before, by reason.
     """
-    scene = jax.tree.map(lambda leaf: np.asarray(leaf[0]), batch)
+    scene = jax.tree.map(lambda leaf: np.asarray(leaf[index]), batch)
     count = int(scene.count)
-    labels = tuple(config.class_names[label] for label in scene.label[:count])
+    labels = tuple(class_names[label] for label in scene.label[:count])
     counts = _plain_counts(scene.counts, changed)
     return FrameResult(scene.boxes.to_array()[:count], scene.score[:count], labels, counts, seconds)
 

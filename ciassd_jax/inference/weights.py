@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +29,7 @@ from ciassd_jax.inference.released_weights import (
     released_rules,
     released_tensors,
 )
-from ciassd_jax.model.network import init_variables
+from ciassd_jax.model.network import variable_shapes
 from ciassd_jax.types import Variables
 
 FORMAT = "ciassd_jax weights 1"
@@ -218,10 +217,8 @@ def _nest(flat: dict[str, np.ndarray]) -> Variables:
     return nested
 
 
-@cache
 def _expected_shapes(config: Config) -> dict[str, tuple[int, ...]]:
-    shapes = jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
-    return {_name(keys): leaf.shape for keys, leaf in _leaves(shapes)}
+    return {_name(keys): leaf.shape for keys, leaf in _leaves(variable_shapes(config.for_inference()))}
 
 
 def _leaves(tree: Variables) -> list[tuple[tuple, Any]]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -54,11 +55,19 @@ def init_variables(key: Array, config: Config) -> Any:
         points_in_range=none,
         points_dropped=none,
     )
-    init = CIASSD(config).init
+    # Parameters depend neither on the backend nor on the compute type, and the dense backend is traced at once.
+    dense = replace(config, backbone=replace(config.backbone, backend="dense"), dtype="float32")
+    init = CIASSD(dense).init
     if isinstance(key, jax.core.Tracer):
         return init(key, voxels)
     # Run once, so the time is in the compiler: without optimisation it takes a fifth.
     return jax.jit(init, compiler_options={"xla_backend_optimization_level": 0})(key, voxels)
+
+
+@cache
+def variable_shapes(config: Config) -> Any:
+    """Shapes and types of {"params", "batch_stats"}; nothing is computed."""
+    return jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
 
 
 class RawPredictions(NamedTuple):

@@ -1,0 +1,68 @@
+"""Compilation of the programs that users wait for: announced, kept for later processes, and ended by Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import jax
+
+# The compiler runs in a thread; the default stack of one is too small for it on some systems.
+_STACK = 2**26
+
+
+def keep_programs() -> None:
+    """Keep compiled programs in ~/.cache/ciassd_jax, so that later processes skip the compilation.
+
+    JAX_COMPILATION_CACHE_DIR, or `jax.config`, sets another folder; JAX_ENABLE_COMPILATION_CACHE=false disables the
+    cache.
+    """
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(cache / "ciassd_jax"))
+
+
+def compile_program(function: Any, *arguments: Any, what: str, signals: Sequence[int] = (), **named: Any) -> Any:
+    """Compile a jitted function for arguments (arrays or their shapes), after a line on stderr that names `what`.
+
+    Ctrl-C ends the wait at once, though the compiler does not stop: it raises KeyboardInterrupt. So does an entry that
+    a signal handler appends to `signals`.
+    """
+    from tqdm.auto import tqdm
+
+    keep_programs()
+    tqdm.write(f"Compiling {what}, once.", file=sys.stderr)
+    sys.stderr.flush()
+    return _in_thread(function.lower(*arguments, **named).compile, signals)
+
+
+def _in_thread(work: Callable[[], Any], signals: Sequence[int]) -> Any:
+    """Run `work` in a thread: unlike the compiler, a main thread that waits receives signals."""
+    if threading.current_thread() is not threading.main_thread():
+        return work()
+    done: Future[Any] = Future()
+
+    def run() -> None:
+        try:
+            done.set_result(work())
+        except BaseException as error:
+            done.set_exception(error)
+
+    before = threading.stack_size(_STACK)
+    try:
+        # A daemon, so that a program that was interrupted need not wait for it.
+        threading.Thread(target=run, name="compiler", daemon=True).start()
+    finally:
+        threading.stack_size(before)
+    while not signals:
+        try:
+            return done.result(timeout=0.1)
+        except TimeoutError:
+            if done.done():
+                raise
+    raise KeyboardInterrupt
