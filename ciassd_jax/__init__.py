@@ -11,12 +11,12 @@ from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.export import export_predict, run_exported
 from ciassd_jax.inference.predict import predict
 from ciassd_jax.inference.weights import load_weights, save_weights
-from ciassd_jax.model.network import init_variables
+from ciassd_jax.model.network import init_variables, predict_features
 from ciassd_jax.simulation import open_synthetic
 from ciassd_jax.training import losses
 from ciassd_jax.training.loop import Intervals, fit
-from ciassd_jax.training.step import create_train_state, train_step
-from ciassd_jax.types import Boxes, Detections, GroundTruth, PointCloud, Scene
+from ciassd_jax.training.step import apply_gradients, compute_loss, create_train_state, train_step
+from ciassd_jax.types import Boxes, Detections, GroundTruth, LossOutput, PointCloud, Scene, TrainState
 from ciassd_jax.view.html import view_html
 from ciassd_jax.view.view_frame import scene_to_view
 
@@ -30,12 +30,16 @@ __all__ = [
     "GroundTruth",
     "InputError",
     "Intervals",
+    "LossOutput",
     "PointCloud",
     "Scene",
+    "TrainState",
+    "apply_gradients",
     "build_database",
     "car",
     "car_lite",
     "car_released",
+    "compute_loss",
     "create_train_state",
     "evaluate",
     "export_predict",
@@ -48,6 +52,7 @@ __all__ = [
     "open_dataset",
     "open_synthetic",
     "predict",
+    "predict_features",
     "run_exported",
     "save_weights",
     "scene_to_view",

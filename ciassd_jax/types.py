@@ -189,6 +189,20 @@ class LossTerms(NamedTuple):
     total: Float[Array, "*b"]
 
 
+class LossOutput(NamedTuple):
+    """What `compute_loss` finds besides the loss.
+
+    `terms` are means over the scenes, `batch_stats` the new running statistics, `predictions` the network's output.
+    `counts` are the overflow counts by name, sums over the scenes.
+    """
+
+    terms: LossTerms
+    targets: Targets
+    predictions: Predictions
+    batch_stats: Any
+    counts: dict[str, jax.Array]
+
+
 class TrainState(NamedTuple):
     """Everything that a training step changes.
 

@@ -96,6 +96,9 @@ class ScheduleConfig:
     ema_decay: float = 0.0
     # Recompute activations in the backward pass instead of storing them.
     remat: bool = False
+    # Parts of the network that keep their weights and their BatchNorm statistics, by the path of their parameters:
+    # "backbone", "neck", "head", or a layer such as "backbone/stage0_0".
+    frozen: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if min(self.total_steps, self.batch_size, self.gradient_accumulation_steps) < 1:

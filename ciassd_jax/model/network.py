@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from ciassd_jax.config import Config
 from ciassd_jax.model.backbone import SPConvNet
@@ -25,19 +25,24 @@ class CIASSD(nn.Module):
     config: Config
     axis_name: str | None = None
 
-    @nn.compact
+    def setup(self) -> None:
+        config, dtype = self.config, jnp.dtype(self.config.dtype)
+        how: dict[str, Any] = {"dtype": dtype, "axis_name": self.axis_name, "program": config.program}
+        self.backbone = SPConvNet(config.backbone, config.grid.shape, **how)
+        self.neck = (SSFA if config.neck.kind == "ssfa" else ConvolutionStack)(config.neck, **how)
+        self.head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, config.program)
+
     def __call__(
         self, voxels: SparseVoxels, *, train: bool = False
     ) -> tuple[Predictions, Int[Array, "B S"], Int[Array, "B S"]]:
         """Predictions, and the active sites kept and dropped at each strided stage of the backbone."""
-        config, dtype = self.config, jnp.dtype(self.config.dtype)
-        how: dict[str, Any] = {"dtype": dtype, "axis_name": self.axis_name, "program": config.program}
-        backbone = SPConvNet(config.backbone, config.grid.shape, **how, name="backbone")
-        bev, kept, dropped = backbone(voxels, train=train)
-        neck = SSFA if config.neck.kind == "ssfa" else ConvolutionStack
-        features = neck(config.neck, **how, name="neck")(bev, train=train)
-        head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, config.program, name="head")
-        return head(features), kept, dropped
+        bev, kept, dropped = self.backbone(voxels, train=train)
+        return self.head(self.neck(bev, train=train)), kept, dropped
+
+    def features(self, voxels: SparseVoxels) -> Float[Array, "B H W C"]:
+        """The BEV map that the head reads, in evaluation mode."""
+        bev, _, _ = self.backbone(voxels, train=False)
+        return self.neck(bev, train=False)
 
 
 def init_variables(key: Array, config: Config) -> Any:
@@ -97,6 +102,18 @@ def voxelize_batch(cloud: PointCloud, config: Config) -> SparseVoxels:
             overflow=grid.overflow,
         )
     )(cloud)
+
+
+def predict_features(state_or_variables: Variables, cloud: PointCloud, config: Config) -> Float[Array, "B H W C"]:
+    """Return the BEV features of a batch of padded clouds: the output of the neck, which the head reads.
+
+    Pure; under `jax.jit` the config is static. Arguments are those of `predict`. Cell (h, w) is centred at
+    x = minimum + (w + 1/2) * cell, y likewise with h, where a cell has `config.backbone.stride` voxels.
+    """
+    features: Any = CIASSD(config).apply(
+        variables_of(state_or_variables), voxelize_batch(cloud, config), method="features"
+    )
+    return features
 
 
 def predict_raw(state_or_variables: Variables, cloud: PointCloud, config: Config) -> RawPredictions:

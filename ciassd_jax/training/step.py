@@ -1,8 +1,8 @@
-"""The training step as one pure function: state and scenes in, new state and metrics out.
+"""The training step as pure functions: `compute_loss`, `apply_gradients`, and `train_step`, which consists of both.
 
-`train_step` runs under `jit`, and with `axis_name` under `pmap` or `shard_map`, where it pools batch statistics,
-gradients and metrics over that axis. Under `jit` alone a batch may be sharded over a mesh too; XLA then gathers the
-features of all scenes on every device.
+They run under `jit`, and with `axis_name` under `pmap` or `shard_map`, where batch statistics, and in `train_step`
+gradients and metrics, are pooled over that axis. Under `jit` alone a batch may be sharded over a mesh too; XLA then
+gathers the features of all scenes on every device.
 """
 
 from __future__ import annotations
@@ -15,17 +15,29 @@ import jax.numpy as jnp
 import optax
 from jax import lax
 
-from ciassd_jax.config import Config, ScheduleConfig
+from ciassd_jax.config import Config
 from ciassd_jax.model.anchors import make_anchors
+from ciassd_jax.model.frozen import check_frozen, keep_frozen, running_statistics, stop_gradients
 from ciassd_jax.model.network import CIASSD, init_variables, voxelize_batch
 from ciassd_jax.training.losses import detection_loss
 from ciassd_jax.training.optimizer import learning_rate, make_optimizer, momentum
 from ciassd_jax.training.targets import assign_targets
-from ciassd_jax.types import LossTerms, Scene, Targets, TrainState, Variables
+from ciassd_jax.types import LossOutput, Scene, TrainState, Variables
 
 
-def create_train_state(key: jax.Array, config: Config, *, variables: Variables | None = None) -> TrainState:
-    """Return the state at step 0, with `variables` ({"params", "batch_stats"}), by default random ones from `key`."""
+def create_train_state(
+    key: jax.Array,
+    config: Config,
+    *,
+    variables: Variables | None = None,
+    optimizer: optax.GradientTransformation | None = None,
+) -> TrainState:
+    """Return the state at step 0, with `variables` ({"params", "batch_stats"}), by default random ones from `key`.
+
+    `optimizer` is any optax transformation, by default that of `config.schedule`; give `train_step` the same one.
+    """
+    if config.schedule.frozen:
+        check_frozen(config)
     start = init_variables(key, config) if variables is None else variables
     params = jax.tree.map(jnp.asarray, start["params"])
     # `step` and `skipped` are separate zeros, because a donated state must not hold one buffer twice.
@@ -33,67 +45,77 @@ def create_train_state(key: jax.Array, config: Config, *, variables: Variables |
         step=jnp.zeros((), jnp.int32),
         params=params,
         batch_stats=jax.tree.map(jnp.asarray, start["batch_stats"]),
-        optimizer=make_optimizer(config.schedule).init(params),
+        optimizer=(optimizer or make_optimizer(config.schedule)).init(params),
         ema=jax.tree.map(jnp.copy, params) if config.schedule.ema_decay else None,
         skipped=jnp.zeros((), jnp.int32),
     )
 
 
 def train_step(
-    state: TrainState, batch: Scene, config: Config, *, axis_name: str | None = None
+    state: TrainState,
+    batch: Scene,
+    config: Config,
+    *,
+    optimizer: optax.GradientTransformation | None = None,
+    axis_name: str | None = None,
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """Update the state from a batch of padded scenes [B, ...]: voxelise, network, targets, losses, optimiser.
 
-    `config` and `axis_name` are static. If the loss or the gradient norm is not finite, the update is skipped:
-    parameters, optimiser state and batch statistics stay, and `skipped` counts it.
+    `config`, `optimizer` and `axis_name` are static: `jax.jit(partial(train_step, config=config, optimizer=...))`.
+    `optimizer` is that of `create_train_state`.
 
-    Returns the new state and scalar metrics: `loss` and its unweighted terms `classification`, `box`, `direction` and
-    `iou` (means over scenes), `positives` (positive anchors per scene), `gradient_norm` before clipping,
-    `learning_rate`, `momentum` (Adam's b1), `skipped`, and the overflow counts (sums over scenes) `points_cut`,
-    `boxes_cut`, `objects_cut`, `points_dropped`, `voxels_dropped` and `sites_dropped`.
+    Returns the new state, which is that of `apply_gradients`, and scalar metrics: `loss` and its unweighted terms
+    `classification`, `box`, `direction` and `iou` (means over scenes), `positives` (positive anchors per scene),
+    `gradient_norm` before clipping, `skipped`, the counts of `LossOutput`, and for the default optimiser
+    `learning_rate` and `momentum` (Adam's b1).
     """
-    terms_of = partial(_loss, batch=batch, config=config, axis_name=axis_name)
-    (_, (terms, targets, batch_stats, counts)), gradient = jax.value_and_grad(terms_of, has_aux=True)(
-        state.params, state.batch_stats
-    )
+    loss_of = partial(compute_loss, batch=batch, config=config, axis_name=axis_name)
+    (_, output), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params, state.batch_stats)
+    positives = (output.targets.label == 1).sum(1).astype(jnp.float32).mean()
     if axis_name is not None:
-        gradient, terms = lax.pmean((gradient, terms), axis_name)
-        batch_stats = lax.pmean(batch_stats, axis_name)
-    # Of one vector, like the norm that the optimiser clips.
-    norm = optax.tree.norm(jnp.concatenate([leaf.reshape(-1) for leaf in jax.tree.leaves(gradient)]))
-    finite = jnp.isfinite(norm) & jnp.isfinite(terms.total)
-    new_state = _update(state, gradient, batch_stats, finite, config.schedule)
-    positives = (targets.label == 1).sum(1).astype(jnp.float32).mean()
-    if axis_name is not None:
-        positives, counts = lax.pmean(positives, axis_name), lax.psum(counts, axis_name)
-    update = state.step // config.schedule.gradient_accumulation_steps
+        terms, batch_stats, positives, gradient = lax.pmean(
+            (output.terms, output.batch_stats, positives, gradient), axis_name
+        )
+        output = output._replace(terms=terms, batch_stats=batch_stats, counts=lax.psum(output.counts, axis_name))
+    new_state = apply_gradients(state, gradient, output, config, optimizer=optimizer)
     metrics = {
-        "loss": terms.total,
-        **{name: value for name, value in terms._asdict().items() if name != "total"},
+        "loss": output.terms.total,
+        **{name: value for name, value in output.terms._asdict().items() if name != "total"},
         "positives": positives,
-        "gradient_norm": norm,
-        "learning_rate": learning_rate(update, config.schedule),
-        "momentum": momentum(update, config.schedule),
+        "gradient_norm": _norm(gradient),
         "skipped": new_state.skipped,
-        **counts,
+        **output.counts,
     }
+    if optimizer is None:
+        update = state.step // config.schedule.gradient_accumulation_steps
+        metrics["learning_rate"] = learning_rate(update, config.schedule)
+        metrics["momentum"] = momentum(update, config.schedule)
     return new_state, metrics
 
 
-def _loss(
-    params: Any, batch_stats: Any, *, batch: Scene, config: Config, axis_name: str | None
-) -> tuple[jax.Array, tuple[LossTerms, Targets, Any, dict[str, jax.Array]]]:
-    """Return the total loss of the batch, and (terms, targets, new batch statistics, overflow counts)."""
+def compute_loss(
+    params: Any, batch_stats: Any, batch: Scene, config: Config, *, axis_name: str | None = None
+) -> tuple[jax.Array, LossOutput]:
+    """Return the loss of a batch of padded scenes [B, ...], and what it consists of.
+
+    For `jax.value_and_grad(compute_loss, has_aux=True)`. Frozen parts (`config.schedule.frozen`) have no gradient, and
+    their BatchNorm layers use their running statistics. With `axis_name` BatchNorm pools over that axis; the loss and
+    the rest are those of the scenes of one device.
+    """
+    frozen = config.schedule.frozen
+    if frozen:
+        check_frozen(config)
     with jax.named_scope("voxelize"):
         voxels = voxelize_batch(batch.cloud, config)
 
     def forward(params: Any) -> Any:
-        variables = {"params": params, "batch_stats": batch_stats}
-        return CIASSD(config, axis_name).apply(variables, voxels, train=True, mutable=["batch_stats"])
+        variables = {"params": stop_gradients(params, frozen), "batch_stats": batch_stats}
+        with running_statistics(frozen):
+            return CIASSD(config, axis_name).apply(variables, voxels, train=True, mutable=["batch_stats"])
 
     if config.schedule.remat:
         forward = jax.checkpoint(forward)
-    (predictions, _, sites_dropped), updated = forward(params)
+    (predictions, sites_kept, sites_dropped), updated = forward(params)
     anchors, labels = make_anchors(config)
     with jax.named_scope("targets"):
         assign = partial(assign_targets, anchors=anchors, anchor_labels=labels, classes=config.classes)
@@ -101,26 +123,48 @@ def _loss(
     with jax.named_scope("losses"):
         terms = detection_loss(predictions, targets, anchors, config.loss)
     counts = {
+        "points_given": voxels.points_given,
         "points_cut": batch.points_cut,
+        "points_dropped": voxels.points_dropped,
+        "boxes_given": batch.truth.count,
         "boxes_cut": batch.boxes_cut,
         "objects_cut": batch.objects_cut,
-        "points_dropped": voxels.points_dropped,
+        "voxels_kept": voxels.count,
         "voxels_dropped": voxels.dropped,
+        "sites_kept": sites_kept,
         "sites_dropped": sites_dropped,
     }
     sums = {name: jnp.sum(each) for name, each in counts.items()}
-    return jnp.asarray(terms.total), (terms, targets, updated["batch_stats"], sums)
+    return jnp.asarray(terms.total), LossOutput(terms, targets, predictions, updated["batch_stats"], sums)
 
 
-def _update(
-    state: TrainState, gradient: Any, batch_stats: Any, finite: jax.Array, schedule: ScheduleConfig
+def apply_gradients(
+    state: TrainState,
+    gradient: Any,
+    output: LossOutput,
+    config: Config,
+    *,
+    optimizer: optax.GradientTransformation | None = None,
 ) -> TrainState:
-    """Return the state after the update, or with the update skipped if it is not finite."""
-    changes, optimizer = make_optimizer(schedule).update(gradient, state.optimizer, state.params)
-    params = optax.apply_updates(state.params, changes)
+    """Return the state after one update by `gradient`, with the batch statistics of `output`.
+
+    `optimizer` is that of `create_train_state`. Frozen parts keep their parameters, whatever the optimiser does. If the
+    loss or the gradient norm is not finite, only `step` and `skipped` change.
+    """
+    frozen, decay = config.schedule.frozen, config.schedule.ema_decay
+    finite = jnp.isfinite(_norm(gradient)) & jnp.isfinite(output.terms.total)
+    update = optax.with_extra_args_support(optimizer or make_optimizer(config.schedule)).update
+    # The loss serves transformations that adapt to it, such as `optax.contrib.reduce_on_plateau`.
+    changes, optimizer_state = update(gradient, state.optimizer, state.params, value=output.terms.total)
+    params = keep_frozen(optax.apply_updates(state.params, changes), state.params, frozen)
     ema = state.ema
     if ema is not None:
-        ema = optax.incremental_update(params, ema, 1 - schedule.ema_decay)
-    changed = TrainState(state.step, params, batch_stats, optimizer, ema, state.skipped)
+        ema = keep_frozen(optax.incremental_update(params, ema, 1 - decay), ema, frozen)
+    changed = TrainState(state.step, params, output.batch_stats, optimizer_state, ema, state.skipped)
     chosen = jax.tree.map(lambda new, old: jnp.where(finite, new, old), changed, state)
     return chosen._replace(step=state.step + 1, skipped=state.skipped + (~finite).astype(jnp.int32))
+
+
+def _norm(gradient: Any) -> jax.Array:
+    """The global norm, of one vector like that which the optimiser clips."""
+    return optax.tree.norm(jnp.concatenate([leaf.reshape(-1) for leaf in jax.tree.leaves(gradient)]))
