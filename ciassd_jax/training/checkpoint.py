@@ -7,6 +7,7 @@ validation score are kept.
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import re
@@ -81,6 +82,7 @@ class Checkpoints:
             "format": FORMAT,
             "config": json.loads(self._config.to_json()),
             "loader": loader._asdict(),
+            "optimizer": _structure(state.optimizer),
             "score": score,
         }
         items = ocp.args.Composite(state=ocp.args.StandardSave(state), progress=ocp.args.JsonSave(progress))
@@ -102,8 +104,8 @@ class Checkpoints:
         """Return the newest readable checkpoint, with the shapes and sharding of `like`; None if there is none.
 
         Newer checkpoints that cannot be read are removed with a FormatWarning, so that their steps can be saved again.
-        Raises InputError for a checkpoint of another config or an earlier format, and if none can be read; then
-        nothing is removed.
+        Raises InputError for a checkpoint of another config, another optimizer or an earlier format, and if none can be
+        read; then nothing is removed.
         """
         import orbax.checkpoint as ocp
 
@@ -113,6 +115,7 @@ class Checkpoints:
                 progress = self._read(step, progress=ocp.args.JsonRestore())["progress"]
                 _check_format(progress, self.folder / str(step))
                 _check_config(progress["config"], self._config, self.folder / str(step))
+                _check_optimizer(progress.get("optimizer"), like, self.folder / str(step))
                 _check_arrays(self.folder / str(step) / "state")
                 state = self._read(step, state=ocp.args.StandardRestore(_abstract(like)))["state"]
             except InputError:
@@ -218,6 +221,22 @@ def _check_config(saved: Any, config: Config, path: Path) -> None:
         difference = first_difference(json.loads(parsed.to_json()), json.loads(config.to_json()))
         raise InputError(
             f"{path} has another config: {difference}; use the config that the run was started with, or another folder."
+        )
+
+
+def _structure(state: Any) -> str:
+    """Return a digest of the names, shapes and types of an optimizer's state."""
+    leaves = jax.tree_util.tree_flatten_with_path(state)[0]
+    text = " ".join(f"{jax.tree_util.keystr(keys)}:{leaf.dtype}{leaf.shape}" for keys, leaf in leaves)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _check_optimizer(saved: str | None, like: TrainState, path: Path) -> None:
+    """Raise InputError for the state of another optimizer; a checkpoint of an earlier version has the default one's."""
+    if saved is not None and saved != _structure(like.optimizer):
+        raise InputError(
+            f"{path} has the state of another optimizer; use the optimizer that the run was started with, or another "
+            "folder."
         )
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import optax
 from jax.sharding import Mesh
 
 from ciassd_jax.config import Config
@@ -78,6 +79,7 @@ def fit(
     *,
     validation: Dataset | None = None,
     variables: Variables | None = None,
+    optimizer: optax.GradientTransformation | None = None,
     intervals: Intervals | None = None,
     progress: bool = False,
     log: Callable[[str], object] = print,
@@ -86,7 +88,8 @@ def fit(
 
     A run that was interrupted or killed, and is resumed by the same call, ends with the same bits as an uninterrupted
     one; it can also resume on other devices. SIGTERM and Ctrl-C stop it after the running step, with the state saved.
-    `variables` are the initial weights, by default random from the seed of the batches. `batches` is closed at the end.
+    `variables` are the initial weights, by default random from the seed of the batches. `optimizer` is any optax
+    transformation, by default that of `config.schedule`. `batches` is closed at the end.
 
     The scenes of a batch are shared by all devices. Each of several processes calls this with its own `shard` of the
     batches and the same folder; only process 0 writes and logs.
@@ -103,9 +106,12 @@ def fit(
         signals = stack.enter_context(deferred_signals())
         mesh = distributed.data_mesh(batches.state.batch_size)
         checkpoints = stack.enter_context(Checkpoints(folder / "checkpoints", config, keep=intervals.keep))
-        state = _resume(checkpoints, batches, config, mesh, log)
+        state = _resume(
+            checkpoints, batches, partial(create_train_state, config=config, optimizer=optimizer), mesh, log
+        )
         if state is None:
-            state = create_train_state(jax.random.key(batches.state.seed), config, variables=variables)
+            key = jax.random.key(batches.state.seed)
+            state = create_train_state(key, config, variables=variables, optimizer=optimizer)
             # Copied, because every step donates the previous state.
             state = distributed.replicate(state, mesh)
         step, skipped = int(state.step), int(state.skipped)
@@ -113,7 +119,19 @@ def fit(
         if metrics is not None:
             stack.callback(metrics.close)
         run = _Run(
-            config, folder, validation, intervals, checkpoints, batches, mesh, metrics, log, state, step, skipped
+            config,
+            folder,
+            validation,
+            optimizer,
+            intervals,
+            checkpoints,
+            batches,
+            mesh,
+            metrics,
+            log,
+            state,
+            step,
+            skipped,
         )
         stopped = run.train(signals, progress and distributed.is_process_0())
     return Fitted(run.state, run.best, stopped)
@@ -126,6 +144,7 @@ class _Run:
     config: Config
     folder: Path
     validation: Dataset | None
+    optimizer: optax.GradientTransformation | None
     intervals: Intervals
     checkpoints: Checkpoints
     batches: Batches
@@ -189,7 +208,7 @@ class _Run:
     def _compile(self, batch: Scene) -> Any:
         """Compile the step, and log its time and memory."""
         start = time.perf_counter()
-        step: Any = distributed.shard_step(partial(train_step, config=self.config), self.mesh)
+        step: Any = distributed.shard_step(partial(train_step, config=self.config, optimizer=self.optimizer), self.mesh)
         program = step.lower(self.state, batch).compile()
         memory: Any = program.memory_analysis()
         sizes = ", ".join(
@@ -265,10 +284,14 @@ class _Run:
 
 
 def _resume(
-    checkpoints: Checkpoints, batches: Batches, config: Config, mesh: Mesh, log: Callable[[str], object]
+    checkpoints: Checkpoints,
+    batches: Batches,
+    create: Callable[[jax.Array], TrainState],
+    mesh: Mesh,
+    log: Callable[[str], object],
 ) -> TrainState | None:
     """Return the state of the newest checkpoint and set the loader to it; None if there is none."""
-    shapes = jax.eval_shape(partial(create_train_state, config=config), jax.random.key(0))
+    shapes = jax.eval_shape(create, jax.random.key(0))
     everywhere = distributed.replicated(mesh)
     like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=everywhere), shapes)
     restored = checkpoints.restore(like)
