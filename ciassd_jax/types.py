@@ -1,7 +1,7 @@
 """Records that pass from one stage to the next.
 
 Every record is a NamedTuple of arrays. Shapes are given for one scene; a batch is the same record with a leading axis
-B on every leaf. Real entries come first, padding after them.
+B on every leaf. Real entries come first, padding after them. A record prints types and shapes, and few numbers.
 
 Letters of shapes:
     B     scenes of a batch
@@ -22,6 +22,7 @@ Coordinates are in the LiDAR frame: x forward, y left, z up, in metres. Yaw is c
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -260,3 +261,39 @@ class Detections(NamedTuple):
     label: Int[Array, "*b D"]
     count: Int[Array, "*b"]  # type: ignore[assignment]
     counts: Counts
+
+
+# Longer arrays print as type and shape.
+_MOST_PRINTED = 8
+
+
+def _describe_record(record: Any) -> str:
+    """Return the record's name and fields in short."""
+    fields = ", ".join(f"{name}={_describe(value)}" for name, value in record._asdict().items())
+    return f"{type(record).__name__}({fields})"
+
+
+def _describe(value: Any) -> str:
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        if _is_printed(value):
+            return np.array2string(np.asarray(jax.device_get(value)), precision=4, separator=", ")
+        return f"{value.dtype.name}[{', '.join(map(str, value.shape))}]"
+    if value is None or type(value).__repr__ is _describe_record or jax.tree_util.all_leaves([value]):
+        return repr(value)
+    leaves = jax.tree.leaves(value)
+    numbers = sum(math.prod(getattr(leaf, "shape", ())) for leaf in leaves)
+    return f"{{{len(leaves)} arrays, {numbers:,} numbers}}"
+
+
+def _is_printed(array: Any) -> bool:
+    """Whether the numbers are few and at hand: not traced, donated, or on other hosts."""
+    if array.ndim > 1 or array.size > _MOST_PRINTED or not isinstance(array.dtype, np.dtype):
+        return False
+    if isinstance(array, jax.Array):
+        return not isinstance(array, jax.core.Tracer) and array.is_fully_addressable and not array.is_deleted()
+    return isinstance(array, np.ndarray | np.generic)
+
+
+# Every record above; its own `repr` would print all numbers.
+for _record in [value for value in globals().values() if hasattr(value, "_fields")]:
+    _record.__repr__ = _describe_record
