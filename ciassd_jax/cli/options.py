@@ -26,6 +26,22 @@ ImageSize = Annotated[
     ),
 ]
 Dtype = Literal["float32", "bfloat16"]
+ScoreThreshold = Annotated[
+    float | None,
+    tyro.conf.arg(
+        metavar="PROBABILITY",
+        help="Lowest class probability of a candidate, before its score is rectified and NMS.",
+        help_behavior_hint="",
+    ),
+]
+MinScore = Annotated[
+    float | None,
+    tyro.conf.arg(
+        metavar="SCORE",
+        help="Lowest score of a detection: the class probability times the predicted IoU ** 4, after NMS.",
+        help_behavior_hint="",
+    ),
+]
 Columns = Annotated[
     str | None,
     tyro.conf.arg(

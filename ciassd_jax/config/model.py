@@ -227,7 +227,10 @@ class HeadConfig:
 class DetectionConfig:
     """From raw predictions to boxes (paper section 3.4 and Algorithm 1)."""
 
+    # The class probability from which an anchor is a candidate, before its score is rectified.
     score_threshold: float = 0.3
+    # The rectified score from which a box is a detection. It changes none of the other boxes.
+    min_score: float = 0.0
     max_candidates: int = 1000
     iou_exponent: float = 4.0
     clamp_iou: bool = True
@@ -241,8 +244,9 @@ class DetectionConfig:
     z_limits: tuple[float, float] = (-5.0, 5.0)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.score_threshold < 1:
-            raise ValueError(f"detection.score_threshold: {self.score_threshold} is outside [0, 1).")
+        for name in ("score_threshold", "min_score"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"detection.{name}: {getattr(self, name)} is outside [0, 1).")
         if self.max_candidates < 1:
             raise ValueError("detection.max_candidates must be at least 1.")
         if self.nms not in ("paper", "released", "rotated"):

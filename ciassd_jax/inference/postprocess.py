@@ -90,17 +90,20 @@ def finish(
     minimum: Vector,
     maximum: Vector,
     frustum: Float[Array, "6 4"] | None,
+    min_score: float = 0.0,
 ) -> tuple[Boxes, Float[Array, " K"], Int[Array, " K"], Int[Array, ""]]:
-    """Orient the selected boxes, and drop those whose centre is outside the frustum or the closed range.
+    """Orient the selected boxes; drop those whose centre is outside the frustum or the closed range, or of low score.
 
     Return boxes, scores, labels and count. The real rows come first, in the order of selection; the others are zero.
-    Yaw is not wrapped.
+    Yaw is not wrapped. A score reaches `min_score` or is dropped.
     """
     keep = clusters.selected
     if frustum is not None:
         keep &= camera.inside_planes(clusters.boxes.center, frustum)
     boxes = box_ops.apply_direction(clusters.boxes, candidates.direction)
     keep &= box_ops.inside_range(boxes, minimum, maximum)
+    if min_score > 0:
+        keep &= clusters.score >= min_score
     order = jnp.argsort(~keep, stable=True)
     keep, *selected = take_rows((keep, boxes, clusters.score, candidates.label), order)
     boxes, score, label = jax.tree.map(
@@ -122,8 +125,14 @@ def postprocess(raw: RawPredictions, config: Config, *, frustum: Float[Array, "B
         candidates, dropped = select_candidates(scene.predictions, anchors, labels, config.detection)
         counts = _count(scene, candidates, dropped)
         candidates, clusters = suppress(candidates, config.detection, config.classes, config.program)
-        found = finish(candidates, clusters, minimum=minimum, maximum=maximum, frustum=planes)
-        boxes, score, label, count = found
+        boxes, score, label, count = finish(
+            candidates,
+            clusters,
+            minimum=minimum,
+            maximum=maximum,
+            frustum=planes,
+            min_score=config.detection.min_score,
+        )
         return Detections(boxes._replace(yaw=box_ops.wrap_angle(boxes.yaw)), score, label, count, counts)
 
     with jax.named_scope("postprocess"):

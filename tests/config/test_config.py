@@ -89,6 +89,7 @@ def test_the_paper_preset():
         "detection.nms": "paper",
         "detection.clamp_iou": True,
         "detection.score_threshold": 0.3,
+        "detection.min_score": 0.0,
         "detection.max_candidates": 1000,
         "detection.nms_iou_threshold": 0.3,
         "detection.iou_exponent": 4.0,
@@ -288,6 +289,7 @@ def test_for_inference_keeps_what_predict_reads():
     assert other.for_inference() == config.for_inference()
     for changed in (
         replace(config, detection=replace(config.detection, score_threshold=0.5)),
+        replace(config, detection=replace(config.detection, min_score=0.5)),
         replace(config, classes=(replace(config.classes[0], support_threshold=1.0), *config.classes[1:])),
         replace(config, classes=(replace(config.classes[0], center_z=0.0), *config.classes[1:])),
         replace(config, grid=replace(config.grid, max_voxels=30000)),
@@ -370,6 +372,8 @@ def test_a_config_needs_no_static_argnames():
         (LossConfig, {"smooth_l1_sigma": 0.0}, r"loss\.smooth_l1_sigma: 0\.0 must be positive and finite"),
         (DetectionConfig, {"score_threshold": 1.0}, r"detection\.score_threshold: 1\.0 is outside \[0, 1\)"),
         (DetectionConfig, {"score_threshold": -0.1}, r"detection\.score_threshold: -0\.1 is outside"),
+        (DetectionConfig, {"min_score": 1.0}, r"detection\.min_score: 1\.0 is outside \[0, 1\)"),
+        (DetectionConfig, {"min_score": math.nan}, r"detection\.min_score: nan is outside \[0, 1\)"),
         (DetectionConfig, {"max_candidates": 0}, r"detection\.max_candidates must be at least 1"),
         (DetectionConfig, {"nms": "soft"}, r"detection\.nms: 'soft' .* choose 'paper', 'released' or 'rotated'"),
         (DetectionConfig, {"sigma_squared": (0.1, 0.0, 0.1, 1.0)}, "detection: sigma_squared must be positive"),

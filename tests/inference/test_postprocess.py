@@ -53,6 +53,7 @@ def detect(
         minimum=(*config.grid.minimum[:2], low),
         maximum=(*config.grid.maximum[:2], high),
         frustum=frustum,
+        min_score=config.detection.min_score,
     )
     return Stages(candidates, numbered.label, dropped, ordered, clusters, *result)
 
@@ -346,6 +347,19 @@ def test_score_threshold_is_inclusive_and_precedes_rectification():
     candidates, dropped = select_candidates(predictions, anchors, jnp.arange(SLOTS), config)
     assert candidates.label[np.asarray(candidates.valid)].tolist() == [1, 0]
     assert dropped == 0
+
+
+def test_the_least_score_is_inclusive_and_drops_detections_alone():
+    """It follows rectification and NMS: the other boxes keep their bits, and nothing counts as overflow."""
+    given = scene([*three_at(20), *three_at(30), *three_at(40)], logit=[2.0] * 3 + [0.0] * 3 + [1.0] * 3)
+    everything = detect(*given, car())
+    boxes, scores, _ = final(everything)
+    for least in (float(scores.min()), float(scores.max())):
+        strict = detect(*given, replace(car(), detection=replace(car().detection, min_score=least)))
+        np.testing.assert_array_equal(final(strict)[0], boxes[scores >= least])
+        np.testing.assert_array_equal(final(strict)[1], scores[scores >= least])
+        assert strict.dropped == everything.dropped == 0
+    assert len(final(strict)[0]) == 1
 
 
 def test_candidates_over_capacity_are_counted():
