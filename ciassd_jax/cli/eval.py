@@ -12,7 +12,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
-from ciassd_jax.cli.options import Dtype, Frames, Unset
+from ciassd_jax.cli.options import Dtype, Frames, MinScore, ScoreThreshold, Unset
 from ciassd_jax.evaluation import LIMITS, Evaluation, Limits, evaluate, format_json, format_report, read_folders
 from ciassd_jax.formats.writing import check_folder, write_text
 from ciassd_jax.inference.detector import Detector
@@ -98,8 +98,8 @@ class Evaluate:
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     dtype: Unset[Dtype] = None
     """Compute type of the network; by default that of the weights."""
-    score_threshold: Unset[float] = None
-    """Lowest class probability of a candidate. Scores are lower: the probability times the predicted IoU ** 4."""
+    score_threshold: ScoreThreshold = None
+    min_score: MinScore = None
     files: Annotated[
         Annotated[Text, tyro.conf.subcommand("txt")] | None,
         tyro.conf.arg(name="", help="Instead of a network:"),
@@ -113,7 +113,11 @@ class Evaluate:
         return self.files.run()
 
     def _network(self) -> int:
-        short = {"dtype": self.dtype, "detection.score_threshold": self.score_threshold}
+        short = {
+            "dtype": self.dtype,
+            "detection.score_threshold": self.score_threshold,
+            "detection.min_score": self.min_score,
+        }
         weights = self.config_options.load(self._weights(), short)
         folder = self.data_set.find_folder()
         for out in (self.out, self.json and self.json.parent):

@@ -11,7 +11,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import warnings_as_lines
-from ciassd_jax.cli.options import Columns, Dtype, ImageSize, Unset, read_columns
+from ciassd_jax.cli.options import Columns, Dtype, ImageSize, MinScore, ScoreThreshold, Unset, read_columns
 from ciassd_jax.data.clouds import CloudFile, find_clouds, read_cloud
 from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.writing import check_folder
@@ -40,14 +40,18 @@ class Predict:
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     dtype: Unset[Dtype] = None
     """Compute type of the network."""
-    score_threshold: Unset[float] = None
-    """Lowest class probability of a candidate. Scores are lower: the probability times the predicted IoU ** 4."""
+    score_threshold: ScoreThreshold = None
+    min_score: MinScore = None
 
     def run(self) -> int:
         clouds = find_clouds(
             self.path, calib=self.calib, image_size=self.image_size, columns=read_columns(self.columns)
         )
-        short = {"dtype": self.dtype, "detection.score_threshold": self.score_threshold}
+        short = {
+            "dtype": self.dtype,
+            "detection.score_threshold": self.score_threshold,
+            "detection.min_score": self.min_score,
+        }
         weights = self.config_options.load(self.weights, short)
         check_folder(self.out)
         detector = Detector(weights.variables, weights.config)
