@@ -1,99 +1,100 @@
-"""Training metrics over time: `metrics.jsonl`, one JSON object per line, and TensorBoard events."""
+"""Training metrics over time: the lines of metrics.jsonl, one JSON object each, and those for the reader's eye."""
 
 from __future__ import annotations
 
-import importlib
 import json
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ciassd_jax.formats.errors import InputError
-from ciassd_jax.formats.writing import replacing
+from ciassd_jax.formats.errors import InputError, Pathlike
 
-# Metrics of which a summary takes the last value instead of the mean.
+METRICS = "metrics.jsonl"
+# Metrics of which a summary takes the last value instead of the mean, and the endings of those that it sums.
 _STATES = ("learning_rate", "momentum", "skipped")
-
-
-class MetricsLog:
-    """The metrics file of a folder, opened to resume after `step`; close it at the end.
-
-    Lines of later steps come from an interrupted run and are removed. `lines` holds all lines of the file. TensorBoard
-    events are written if tensorboardX is installed. Raises InputError if the file cannot be written.
-    """
-
-    def __init__(self, workdir: Path, step: int, log: Callable[[str], object] = print) -> None:
-        self.path = workdir / "metrics.jsonl"
-        self.lines = [line for line in _read(self.path) if line["step"] <= step]
-        with replacing(self.path) as temporary:
-            temporary.write_text("".join(map(_format, self.lines)), encoding="utf-8")
-        self._stream = open(self.path, "a", encoding="utf-8")  # noqa: SIM115
-        self._events = _open_events(workdir / "tb", step, log)
-
-    def write(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Append a line and flush it; non-finite numbers become null."""
-        line = {"step": step, **{name: value if math.isfinite(value) else None for name, value in numbers.items()}}
-        with self._refusing():
-            self._stream.write(_format(line))
-            self._stream.flush()
-        self.lines.append(line)
-        if self._events is not None:
-            for name, value in numbers.items():
-                self._events.add_scalar(name, value, step)
-
-    def close(self) -> None:
-        """Close the files."""
-        with self._refusing():
-            self._stream.close()
-            if self._events is not None:
-                self._events.close()
-
-    @contextmanager
-    def _refusing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise InputError(
-                f"{self.path} cannot be written ({error.strerror}); free some space and run again: the checkpoints "
-                "are intact."
-            ) from error
+_COUNTS = ("_given", "_kept", "_cut", "_dropped")
+_TERMS = {"classification": "cls", "box": "box", "direction": "dir", "iou": "iou"}
 
 
 def summarise(rows: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
-    """Return the metrics of several steps as one: the sum of overflow counts, the last of states, else the mean."""
+    """Return the metrics of several steps as one: the sum of counts, the last of states, else the mean."""
     numbers = {}
     for name in rows[0]:
         values = [row[name] for row in rows]
         if name in _STATES:
             numbers[name] = float(values[-1])
         else:
-            numbers[name] = float(np.sum(values) if _is_overflow_count(name) else np.mean(values))
+            numbers[name] = float(np.sum(values) if name.endswith(_COUNTS) else np.mean(values))
     return numbers
 
 
-def describe_metrics(step: int, total: int, numbers: Mapping[str, float]) -> str:
-    """Return one line on the summarised metrics of a training of `total` steps.
+def describe_metrics(step: int, total: int, numbers: Mapping[str, float], *, scenes: int, remaining: float) -> str:
+    """Return one line on the summarised metrics of a training of `total` steps with `scenes` each.
 
-    It has the overflow counts above 0, and a warning if no anchor was positive.
+    `remaining` is the estimate of the seconds to the end. The line has what was dropped, in percent of what was given,
+    and a warning if no anchor was positive.
     """
-    dropped = [f"{name} {value:.0f}" for name, value in numbers.items() if _is_overflow_count(name) and value]
-    line = f"step {step}/{total}  epoch {numbers['epoch']:.2f}  loss {numbers['loss']:.4f}"
-    line += f"  {numbers['seconds']:.2f} s/step" + (f"  ({', '.join(dropped)})" if dropped else "")
-    if numbers["positives"]:
-        return line
-    return f"{line}  warning: no anchor is positive, so nothing is learned; run `ciassd data check` with this config"
+    terms = " ".join(f"{short} {numbers[name]:.3f}" for name, short in _TERMS.items())
+    parts = [
+        f"step {step:>{len(str(total))}}/{total}",
+        f"ETA {_duration(remaining)}",
+        # An optimiser of one's own does not tell its rate.
+        *([f"lr {numbers['learning_rate']:.1e}"] if "learning_rate" in numbers else []),
+        f"loss {numbers['loss']:.4f} ({terms})",
+        f"positives {numbers['positives']:.1f}",
+        f"{scenes / numbers['seconds']:.3g} frames/s",
+        *([dropped] if (dropped := _describe_dropped(numbers)) else []),
+        *([f"{numbers['skipped']:.0f} updates skipped, not finite"] if numbers["skipped"] else []),
+    ]
+    if not numbers["positives"]:
+        parts.append("warning: no anchor is positive, so nothing is learned; run `ciassd data check` with this config")
+    return "  ".join(parts)
 
 
-def _is_overflow_count(name: str) -> bool:
-    return name.endswith(("_cut", "_dropped"))
+def _describe_dropped(numbers: Mapping[str, float]) -> str:
+    """Return what was cut or dropped, each in percent of what was given; as a number where that is not known."""
+    phrases = []
+    for name, lost in numbers.items():
+        what, _, how = name.rpartition("_")
+        if how not in ("cut", "dropped") or not lost:
+            continue
+        # Points are cut before the others are given to the voxelisation.
+        rest = numbers.get(f"{what}_kept", numbers.get(f"{what}_given"))
+        given = None if rest is None else rest + (0 if name == "points_dropped" else lost)
+        phrases.append(f"{what} {how} " + (f"{lost:.0f}" if given is None else f"{100 * lost / given:.2g}%"))
+    return ", ".join(phrases)
 
 
-def _read(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the complete lines of a metrics file; a killed run may truncate the last one."""
+def _duration(seconds: float) -> str:
+    """Return a time in two units, such as 2d03h, 3h05m, 12m30s, or 45s."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    days, hours = divmod(hours, 24)
+    if days:
+        return f"{days}d{hours:02}h"
+    if hours:
+        return f"{hours}h{minutes:02}m"
+    return f"{minutes}m{rest:02}s" if minutes else f"{rest}s"
+
+
+def read_metrics(workdir: Pathlike) -> list[dict[str, Any]]:
+    """Return the lines of a training's metrics.jsonl; numbers that were not finite are None.
+
+    Raises InputError if the folder has no such file, or one without a line.
+    """
+    path = Path(workdir) / METRICS
+    if not path.is_file():
+        raise InputError(f"{workdir} has no {METRICS}; give the folder of a training.")
+    lines = list(parse_lines(path))
+    if not lines:
+        raise InputError(f"{path} has no line yet; wait until the training has logged its first steps.")
+    return lines
+
+
+def parse_lines(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the complete lines of a metrics file, none if it is missing; a killed run may truncate the last one."""
     if not path.is_file():
         return
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -105,14 +106,6 @@ def _read(path: Path) -> Iterator[dict[str, Any]]:
             yield line
 
 
-def _format(line: Mapping[str, Any]) -> str:
+def format_line(line: Mapping[str, Any]) -> str:
+    """Return a line of a metrics file, with its end."""
     return json.dumps(line, allow_nan=False) + "\n"
-
-
-def _open_events(folder: Path, step: int, log: Callable[[str], object]) -> Any:
-    try:
-        writer = importlib.import_module("tensorboardX").SummaryWriter
-    except ImportError:
-        log("tensorboardX is not installed, so no TensorBoard events are written; metrics.jsonl has the same numbers.")
-        return None
-    return writer(str(folder), purge_step=step + 1)

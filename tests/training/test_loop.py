@@ -1,6 +1,7 @@
 """The training loop: the files of its folder, and interrupted runs that resume to the same bits."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -27,12 +28,12 @@ from ciassd_jax import create_train_state, load_weights, make_batches, open_data
 from ciassd_jax.data.gt_sampling import find_database
 from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import InputError
-from ciassd_jax.model.network import variables_of
+from ciassd_jax.model.checks import variables_of
 from ciassd_jax.simulation import Lidar
 from ciassd_jax.training import loop
 from ciassd_jax.training.checkpoint import Checkpoints
 from ciassd_jax.training.loop import Fitted, Intervals, TrainingError, fit
-from ciassd_jax.training.metrics import MetricsLog, describe_metrics
+from ciassd_jax.training.record import Record
 from ciassd_jax.training.signals import deferred_signals
 from ciassd_jax.types import TrainState
 
@@ -91,7 +92,7 @@ def test_the_folder_is_complete(whole: tuple[Fitted, Path, list[str]]) -> None:
     assert fitted.stopped is None
     names = {path.name for path in workdir.iterdir()}
     assert names == {
-        *("config.json", "versions.json", "metrics.jsonl", "checkpoints", "eval"),
+        *("config.json", "versions.json", "metrics.jsonl", "train.log", "checkpoints", "eval"),
         *("best.safetensors", "last.safetensors"),
     }
     assert (workdir / "config.json").read_text().strip() == mini_config().to_json()
@@ -103,6 +104,11 @@ def test_the_folder_is_complete(whole: tuple[Fitted, Path, list[str]]) -> None:
     assert {"8", "9"} <= {path.name for path in (workdir / "checkpoints").iterdir()}
     assert sum(text.startswith("Compiled the step of 2 scenes for 2 cpu devices in ") for text in logged) == 1
     assert sum("tensorboardX" in text for text in logged) == 1
+    assert (
+        logged[-1] == f"Trained 9 steps; best AP {fitted.best:.2f}. Weights, metrics and evaluations are in {workdir}."
+    )
+    kept = (workdir / "train.log").read_text().splitlines()
+    assert [re.sub(r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  ", "", line) for line in kept] == logged
 
 
 def test_the_metrics_have_every_step_and_scores(whole: tuple[Fitted, Path, list[str]]) -> None:
@@ -149,14 +155,34 @@ def test_a_stopped_run_resumes_to_the_same_bits(
 
     stopped = mini_fit(root, tmp_path, stop)
     assert (int(stopped.state.step), stopped.stopped) == (3, number)
+    told = (tmp_path / "train.log").read_text().splitlines()
+    assert told[-1].endswith(f"  Stopped by {signal.Signals(number).name} after step 3, which is saved.")
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == handlers
     logged: list[str] = []
     resumed = mini_fit(root, tmp_path, logged.append)
     assert logged[0].startswith("Resuming from step 3 in ")
+    assert (tmp_path / "train.log").read_text().splitlines()[: len(told)] == told
     assert_same_bits(resumed.state, whole[0].state)
     assert lines(tmp_path) == lines(whole[1])
     # A complete run has nothing left to do.
     assert_same_bits(mini_fit(root, tmp_path).state, whole[0].state)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_compilation_at_once(
+    number: int, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compile_long(self: Any, batch: Any) -> None:
+        signal.raise_signal(number)
+        raise AssertionError("the signal was deferred")
+
+    monkeypatch.setattr(loop._Run, "_compile", compile_long)
+    logged: list[str] = []
+    stopped = mini_fit(root, tmp_path, logged.append)
+    assert (int(stopped.state.step), stopped.stopped) == (0, number)
+    assert logged[-1] == f"Stopped by {signal.Signals(number).name} before the first step: there is nothing to save."
+    assert not any((tmp_path / "checkpoints").iterdir())
+    assert not (tmp_path / "last.safetensors").exists()
 
 
 @pytest.mark.slow
@@ -197,6 +223,7 @@ def test_an_invalid_label_is_named_and_the_state_is_saved(root: Path, tmp_path: 
     with pytest.raises(InputError, match=r"Frame 00000\d: object 0 \(Car\) has the size nan"):
         mini_fit(root, tmp_path, batches=batches)
     assert int(saved_state(tmp_path).step) == len(lines(tmp_path)) >= 1
+    assert "  InputError: Frame 00000" in (tmp_path / "train.log").read_text().splitlines()[-1]
 
 
 def test_a_dead_worker_loses_no_step(
@@ -239,9 +266,8 @@ def test_another_stream_is_refused(whole: tuple[Fitted, Path, list[str]], root: 
 def test_later_and_truncated_lines_are_removed(tmp_path: Path) -> None:
     written = "".join(f'{{"step": {step}, "score": {step}.5}}\n' for step in (2, 4, 6))
     (tmp_path / "metrics.jsonl").write_text(f'{written}{{"step": 8, "sco')
-    log = MetricsLog(tmp_path, 4, lambda text: None)
-    log.write(6, {"loss": float("inf")})
-    log.close()
+    with Record(tmp_path, 4, lambda text: None) as record:
+        record.write(6, {"loss": float("inf")})
     assert [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()] == [
         {"step": 2, "score": 2.5},
         {"step": 4, "score": 4.5},
@@ -263,9 +289,8 @@ def test_events_are_written_if_tensorboardx_is_installed(tmp_path: Path, monkeyp
             calls.append(())
 
     monkeypatch.setitem(sys.modules, "tensorboardX", types.SimpleNamespace(SummaryWriter=Writer))
-    log = MetricsLog(tmp_path, 4, calls.append)  # type: ignore[arg-type]
-    log.write(5, {"loss": 2.0})
-    log.close()
+    with Record(tmp_path, 4, lambda text: None) as record:
+        record.write(5, {"loss": 2.0})
     assert calls == [(str(tmp_path / "tb"), 5), ("loss", 2.0, 5), ()]
 
 
@@ -293,17 +318,18 @@ def test_a_second_signal_gets_the_previous_handler() -> None:
             signal.raise_signal(signal.SIGINT)
 
 
+def test_a_signal_may_raise_at_once() -> None:
+    with deferred_signals() as received:
+        with pytest.raises(KeyboardInterrupt), received.raising():
+            signal.raise_signal(signal.SIGTERM)
+        assert received == [signal.SIGTERM]
+        with pytest.raises(KeyboardInterrupt), received.raising():
+            raise AssertionError("the signal came before")
+
+
 def test_an_ignored_signal_stays_ignored() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with deferred_signals() as received:
         signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     assert received == []
-
-
-@pytest.mark.parametrize("positives", [0.0, 1.5])
-def test_a_line_warns_of_steps_without_positives(positives: float) -> None:
-    numbers = {"epoch": 1.0, "loss": 0.5, "seconds": 0.1, "positives": positives, "sites_dropped": 2.0}
-    line = describe_metrics(50, 100, numbers)
-    assert line.startswith("step 50/100  epoch 1.00  loss 0.5000  0.10 s/step  (sites_dropped 2)")
-    assert ("no anchor is positive" in line) == (positives == 0)
