@@ -13,7 +13,7 @@ from ciassd_jax.config import DetectionConfig
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.gt_sampling import database_path, find_database
 from ciassd_jax.data.loader import Batches
-from ciassd_jax.model.network import variables_of
+from ciassd_jax.model.checks import variables_of
 from ciassd_jax.training.loop import Intervals, fit
 from ciassd_jax.types import Variables
 

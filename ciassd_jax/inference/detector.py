@@ -20,7 +20,7 @@ from ciassd_jax.formats.points import check_intensity
 from ciassd_jax.inference.predict import compile_predict
 from ciassd_jax.inference.results import FrameResult, frame_result
 from ciassd_jax.inference.weights import find_weights, load_weights
-from ciassd_jax.model.network import variables_of
+from ciassd_jax.model.checks import variables_of
 from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.ops.voxelize import MAX_INTENSITY
 from ciassd_jax.types import Array, PointCloud, Variables

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache, partial
 
 import jax
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from ciassd_jax.config import Config
 from ciassd_jax.inference.postprocess import postprocess
 from ciassd_jax.inference.programs import compile_program
+from ciassd_jax.model.checks import check_cloud
 from ciassd_jax.model.network import predict_raw, variable_shapes
 from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.types import Array, Detections, PointCloud, Variables
@@ -25,11 +27,13 @@ def predict(
 ) -> Detections:
     """Detect objects in a batch of padded clouds. Pure; under `jax.jit` the config is static.
 
-    `state_or_variables` is a train state, or {"params": ..., "batch_stats": ...}. `cloud` holds points [B, P, 4] (x, y,
-    z in metres, intensity in [0, 1]) and count [B]. `frustum` (`ops.camera.frustum_planes`) drops boxes whose centre is
-    outside the camera's view, as the released code does. Return at most `config.detection.max_candidates` boxes per
-    scene, in the order of selection, with yaw in [-pi, pi).
+    `state_or_variables` is a train state, or a mapping {"params": ..., "batch_stats": ...}. `cloud` holds float32
+    points [B, P, 4] (x, y, z in metres, intensity in [0, 1]) and count [B]. `frustum` (`ops.camera.frustum_planes`)
+    drops boxes whose centre is outside the camera's view, as the released code does. Return at most
+    `config.detection.max_candidates` boxes per scene, in the order of selection, with yaw in [-pi, pi). Raises
+    ValueError for arguments of another shape or type; under `jax.jit` it does so while it is traced.
     """
+    check_cloud(cloud, frustum)
     return postprocess(predict_raw(state_or_variables, cloud, config), config, frustum=frustum)
 
 
@@ -40,6 +44,9 @@ def compile_predict(config: Config, num_points: int, batch: int = 1) -> jax.stag
     Programs are kept and shared by all callers of an equal config; pass `config.for_inference()`.
     """
     variables = variable_shapes(config)
+    if config.program == "auto" and jax.default_backend() == "cpu":
+        # Half the time of tracing goes to the form that only accelerators use.
+        config = replace(config, program="cpu")
     cloud = PointCloud(np.zeros((batch, num_points, 4), np.float32), np.zeros(batch, np.int32))
     scenes = "1 scene" if batch == 1 else f"{batch} scenes"
     return compile_program(

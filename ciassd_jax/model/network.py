@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from ciassd_jax.config import Config
 from ciassd_jax.model.backbone import SPConvNet
+from ciassd_jax.model.checks import check_cloud, check_variables, variables_of
 from ciassd_jax.model.head import MultiTaskHead
 from ciassd_jax.model.neck import SSFA, ConvolutionStack
 from ciassd_jax.ops.voxelize import voxelize
@@ -72,7 +73,7 @@ def init_variables(key: Array, config: Config) -> Any:
 @cache
 def variable_shapes(config: Config) -> Any:
     """Shapes and types of {"params", "batch_stats"}; nothing is computed."""
-    return jax.eval_shape(partial(init_variables, config=config), jax.random.key(0))
+    return jax.eval_shape(lambda: init_variables(jax.random.key(0), config))
 
 
 class RawPredictions(NamedTuple):
@@ -85,7 +86,11 @@ class RawPredictions(NamedTuple):
 
 
 def voxelize_batch(cloud: PointCloud, config: Config) -> SparseVoxels:
-    """Voxelise a batch of padded clouds; voxels and their features have the scale and height of `config.input`."""
+    """Voxelise a batch of padded clouds; voxels and their features have the scale and height of `config.input`.
+
+    Raises ValueError for clouds of another shape or type.
+    """
+    check_cloud(cloud)
     grid, scale, shift = config.grid, config.input.intensity_scale, config.input.z_shift
     if (scale, shift) != (1, 0):
         factor, offset = jnp.array([1, 1, 1, 1 / scale], jnp.float32), jnp.array([0, 0, shift, 0], jnp.float32)
@@ -110,9 +115,8 @@ def predict_features(state_or_variables: Variables, cloud: PointCloud, config: C
     Pure; under `jax.jit` the config is static. Arguments are those of `predict`. Cell (h, w) is centred at
     x = minimum + (w + 1/2) * cell, y likewise with h, where a cell has `config.backbone.stride` voxels.
     """
-    features: Any = CIASSD(config).apply(
-        variables_of(state_or_variables), voxelize_batch(cloud, config), method="features"
-    )
+    variables = _fitting_variables(state_or_variables, config)
+    features: Any = CIASSD(config).apply(variables, voxelize_batch(cloud, config), method="features")
     return features
 
 
@@ -125,14 +129,13 @@ def predict_raw(state_or_variables: Variables, cloud: PointCloud, config: Config
 
 def predict_voxels(state_or_variables: Variables, voxels: SparseVoxels, config: Config) -> RawPredictions:
     """Run the network in evaluation mode on a batch of voxelised scenes."""
-    output: Any = CIASSD(config).apply(variables_of(state_or_variables), voxels)
+    output: Any = CIASSD(config).apply(_fitting_variables(state_or_variables, config), voxels)
     predictions, kept, dropped = output
     return RawPredictions(predictions, voxels, kept, dropped)
 
 
-def variables_of(state_or_variables: Variables) -> Variables:
-    """{"params", "batch_stats"} of a train state, with the running mean where it has one, or of a dictionary."""
-    if isinstance(state_or_variables, dict):
-        return {name: state_or_variables[name] for name in ("params", "batch_stats")}
-    state = state_or_variables
-    return {"params": state.params if state.ema is None else state.ema, "batch_stats": state.batch_stats}
+def _fitting_variables(state_or_variables: Variables, config: Config) -> dict[str, Any]:
+    """`variables_of` a state or variables; raises ValueError if they do not fit the config."""
+    variables = variables_of(state_or_variables)
+    check_variables(variables, variable_shapes(replace(config.for_inference(), program="auto")))
+    return variables

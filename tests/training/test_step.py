@@ -19,7 +19,7 @@ from ciassd_jax import Config, car, create_train_state, make_batches, train_step
 from ciassd_jax.config import ScheduleConfig
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.data.loader import finish_scenes
-from ciassd_jax.model.network import variables_of
+from ciassd_jax.model.checks import variables_of
 from ciassd_jax.training.optimizer import learning_rate, make_optimizer, momentum
 from ciassd_jax.types import Boxes, Scene
 
