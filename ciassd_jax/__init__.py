@@ -8,7 +8,7 @@ from ciassd_jax.data.loader import make_batches
 from ciassd_jax.evaluation import evaluate
 from ciassd_jax.formats.errors import InputError
 from ciassd_jax.inference.detector import Detector
-from ciassd_jax.inference.export import export_predict, run_exported
+from ciassd_jax.inference.export import export_predict, load_exported
 from ciassd_jax.inference.predict import predict
 from ciassd_jax.inference.weights import load_weights, save_weights
 from ciassd_jax.model.network import init_variables, predict_features
@@ -20,7 +20,7 @@ from ciassd_jax.types import Boxes, Detections, GroundTruth, LossOutput, PointCl
 from ciassd_jax.view.html import view_html
 from ciassd_jax.view.view_frame import scene_to_view
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Boxes",
@@ -45,6 +45,7 @@ __all__ = [
     "export_predict",
     "fit",
     "init_variables",
+    "load_exported",
     "load_weights",
     "losses",
     "make_batches",
@@ -53,7 +54,6 @@ __all__ = [
     "open_synthetic",
     "predict",
     "predict_features",
-    "run_exported",
     "save_weights",
     "scene_to_view",
     "three_class",
