@@ -34,7 +34,7 @@ from ciassd_jax.training.progress import Progress
 from ciassd_jax.training.record import Record, open_record
 from ciassd_jax.training.signals import Signals, deferred_signals
 from ciassd_jax.training.step import create_train_state, train_step
-from ciassd_jax.training.validation import score_weights
+from ciassd_jax.training.validation import describe_score, score_weights
 from ciassd_jax.types import Scene, TrainState, Variables
 
 _BEST, _LAST = TRAINED
@@ -260,7 +260,7 @@ class _Run:
         numbers = score_weights(self.state, self.validation, self.config, self.folder / "eval" / str(step))
         score, best = numbers["score"], self.record.best
         self.record.write(step, numbers)
-        self.record.log(f"step {step}  " + "  ".join(f"{name} {round(value, 2):g}" for name, value in numbers.items()))
+        self.record.log(f"step {step}  {describe_score(numbers)}; eval/{step}/table.txt has the rest")
         if best is None or score > best:
             self._export(_BEST)
         return score

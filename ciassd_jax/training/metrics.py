@@ -36,13 +36,13 @@ def describe_metrics(step: int, total: int, numbers: Mapping[str, float], *, sce
     `remaining` is the estimate of the seconds to the end. The line has what was dropped, in percent of what was given,
     and a warning if no anchor was positive.
     """
-    terms = " ".join(f"{short} {numbers[name]:.3f}" for name, short in _TERMS.items())
+    terms = " ".join(f"{short} {numbers[name]:.3g}" for name, short in _TERMS.items())
     parts = [
         f"step {step:>{len(str(total))}}/{total}",
         f"ETA {_duration(remaining)}",
         # An optimiser of one's own does not tell its rate.
         *([f"lr {numbers['learning_rate']:.1e}"] if "learning_rate" in numbers else []),
-        f"loss {numbers['loss']:.4f} ({terms})",
+        f"loss {numbers['loss']:.4g} ({terms})",
         f"positives {numbers['positives']:.1f}",
         f"{scenes / numbers['seconds']:.3g} frames/s",
         *([dropped] if (dropped := _describe_dropped(numbers)) else []),
@@ -54,17 +54,15 @@ def describe_metrics(step: int, total: int, numbers: Mapping[str, float], *, sce
 
 
 def _describe_dropped(numbers: Mapping[str, float]) -> str:
-    """Return what was cut or dropped, each in percent of what was given; as a number where that is not known."""
+    """Return what was cut or dropped, in percent of what was given; as a number where that is not known."""
     phrases = []
-    for name, lost in numbers.items():
-        what, _, how = name.rpartition("_")
-        if how not in ("cut", "dropped") or not lost:
-            continue
-        # Points are cut before the others are given to the voxelisation.
-        rest = numbers.get(f"{what}_kept", numbers.get(f"{what}_given"))
-        given = None if rest is None else rest + (0 if name == "points_dropped" else lost)
-        phrases.append(f"{what} {how} " + (f"{lost:.0f}" if given is None else f"{100 * lost / given:.2g}%"))
-    return ", ".join(phrases)
+    for what in ("points", "boxes", "objects", "voxels", "sites"):
+        given, kept, cut, dropped = (numbers.get(what + ending, 0.0) for ending in _COUNTS)
+        # Points and boxes are cut before they are given to the step.
+        if lost := cut + dropped:
+            before = given + cut if given else kept + dropped
+            phrases.append(f"{what} {100 * lost / before:.3g}%" if given or kept else f"{what} {lost:.0f}")
+    return f"dropped {', '.join(phrases)}" if phrases else ""
 
 
 def _duration(seconds: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,17 @@ def precisions(evaluation: Evaluation, config: Config) -> dict[str, float]:
     }
     strict = [precision_of(evaluation, name, "3d", of_class[0], level=level) for name, of_class in limits.items()]
     return {"score": sum(strict) / len(strict)} | numbers
+
+
+def describe_score(numbers: Mapping[str, float]) -> str:
+    """Return the score of `score_weights` and that of each class in a few words."""
+    strict: dict[str, float] = {}
+    for name, value in numbers.items():
+        if "_3d_" in name:
+            # The strict limit of a class comes first.
+            strict.setdefault(name.rpartition("_3d_")[0], value)
+    classes = ", ".join(f"{name} {value:.2f}" for name, value in strict.items())
+    return f"AP {numbers['score']:.2f} ({classes}), {numbers['detections']:.0f} detections"
 
 
 def precision_of(

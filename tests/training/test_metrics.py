@@ -20,7 +20,7 @@ NUMBERS = {
     "seconds": 0.5,
 }
 LINE = (
-    "step  1200/55680  ETA 7h34m  lr 2.8e-03  loss 1.2346 (cls 0.500 box 0.250 dir 0.125 iou 0.062)  positives 33.2"
+    "step  1200/55680  ETA 7h34m  lr 2.8e-03  loss 1.235 (cls 0.5 box 0.25 dir 0.125 iou 0.0625)  positives 33.2"
     "  8 frames/s"
 )
 
@@ -38,7 +38,7 @@ def test_what_was_dropped_is_a_share_of_what_was_given() -> None:
     points = {"points_given": 950.0, "points_cut": 50.0, "points_dropped": 19.0}
     others = {"boxes_given": 3.0, "boxes_cut": 1.0, "objects_cut": 2.0, "voxels_kept": 100.0, "voxels_dropped": 0.0}
     line = describe(**points, **others, sites_kept=997.0, sites_dropped=3.0)
-    assert line == f"{LINE}  points cut 5%, points dropped 2%, boxes cut 25%, objects cut 2, sites dropped 0.3%"
+    assert line == f"{LINE}  dropped points 6.9%, boxes 25%, objects 2, sites 0.3%"
 
 
 def test_an_optimizer_of_ones_own_has_no_learning_rate() -> None:
