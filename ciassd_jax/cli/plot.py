@@ -38,5 +38,6 @@ class Plot:
             raise UsageError(str(error)) from error
         with replacing(out) as temporary:
             figure.savefig(temporary, format="png")
-        print(f"Wrote {out}: {', '.join(f'{name} to step {lines[-1]["step"]}' for name, lines in runs.items())}.")
+        drawn = ", ".join(f"{name} up to step {lines[-1]['step']}" for name, lines in runs.items())
+        print(f"Wrote {out}: {drawn}.")
         return 0

@@ -26,7 +26,7 @@ _TITLES = {
     "positives": "positive anchors per scene",
 }
 _COLUMNS = 4
-_STYLES = ("-", "--", "-.", ":")
+_STYLES: Sequence[Any] = ("-", "--", "-.", ":")
 
 
 def plot_curves(runs: Mapping[str, Lines]) -> Figure:
