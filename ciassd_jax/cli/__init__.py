@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import gc
 import os
+import platform
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import tyro
@@ -24,8 +26,9 @@ from ciassd_jax.cli.demo import Demo
 from ciassd_jax.cli.eval import Evaluate
 from ciassd_jax.cli.info import Info
 from ciassd_jax.cli.messages import UsageError, describe, option_of, silenced
+from ciassd_jax.cli.names import check_names
+from ciassd_jax.cli.plot import Plot
 from ciassd_jax.cli.predict import Predict
-from ciassd_jax.cli.renamed import check_names
 from ciassd_jax.cli.submit import Submit
 from ciassd_jax.cli.train import Train
 from ciassd_jax.cli.view import View
@@ -54,6 +57,7 @@ Command = (
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Plot, tyro.conf.subcommand("plot")]
     | Annotated[tyro.conf.OmitSubcommandPrefixes[Evaluate], tyro.conf.subcommand("eval")]
     | Annotated[Submit, tyro.conf.subcommand("submit")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
@@ -73,7 +77,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     try:
-        check_names(arguments)
+        check_names(arguments, Command)
+        if "--version" in arguments:
+            print(f"ciassd_jax {version('ciassd_jax')}, JAX {version('jax')}, Python {platform.python_version()}")
+            return 0
         code = _parse(arguments).run()
         sys.stdout.flush()
         return code
@@ -94,7 +101,7 @@ def _parse(arguments: Sequence[str]) -> Command:
         Command,
         prog="ciassd",
         args=others,
-        description="LiDAR 3D object detection in JAX.",
+        description="LiDAR 3D object detection in JAX. --version prints the versions of the package, JAX and Python.",
         config=(tyro.conf.DisallowNone, tyro.conf.PositionalMetavarFromFieldName),
     )
     return command if replaced is None else _with_fields(command, replaced)

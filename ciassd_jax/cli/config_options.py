@@ -19,9 +19,8 @@ from ciassd_jax.cli.messages import UsageError, option_of, values_from_options
 from ciassd_jax.cli.options import Unset
 from ciassd_jax.config import Config
 from ciassd_jax.config.presets import PRESETS
-from ciassd_jax.formats.errors import InputError
 from ciassd_jax.inference.scoring import find_trained
-from ciassd_jax.inference.weights import Weights, check_fits, find_weights, load_weights, read_config
+from ciassd_jax.inference.weights import Weights, find_weights, load_weights, read_config
 
 if TYPE_CHECKING:
     Preset = str
@@ -84,16 +83,10 @@ class ConfigOptions:
 
     def load(self, path: Path, short: Mapping[str, Any] | None = None) -> Weights:
         """Load weights from a file or by the name of bundled ones, with the chosen config, by default their own."""
-        weights = load_weights(find_weights(path))
+        file = find_weights(path)
+        weights = load_weights(file)
         config = self.resolve(weights.config, short)
-        try:
-            check_fits(weights, config, path)
-        except InputError as error:
-            named = (
-                f"--preset {self.preset}" if self.preset else f"--config {self.config}" if self.config else "--config."
-            )
-            raise UsageError(f"{named} cannot be used with these weights: {error}") from error
-        return weights._replace(config=config)
+        return weights if config == weights.config else load_weights(file, config)
 
 
 def _replace_field(config: Config, name: str, value: Any) -> Config:
@@ -118,6 +111,7 @@ class _Source:
 
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     weights: Unset[Path] = None
+    init_from: Unset[Path] = None
     workdir: Unset[Path] = None
 
 
@@ -162,7 +156,7 @@ def print_fields(arguments: Sequence[str]) -> None:
 def _source(arguments: Sequence[str]) -> Config:
     """Return the config that the arguments of a command name."""
     named = tyro.cli(_Source, args=list(arguments), return_unknown_args=True, add_help=False)[0]
-    weights = named.weights
+    weights = named.weights or named.init_from
     if arguments[0] == "eval" and named.workdir is not None:
         weights = find_trained(named.workdir)
     if arguments[0] == "demo" and weights is None:

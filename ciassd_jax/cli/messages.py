@@ -24,6 +24,8 @@ _OPTIONS = {
     "as `z_shift`": "with --z-shift",
     "as `classes`": "with --classes",
     "leave out `calib`": "leave out --calib",
+    "use the config of the file": "leave out --preset and --config to use the config of the file",
+    "`partial`": "`ciassd train --init-from FILE --partial`",
     "`overwrite`": "--overwrite",
     "`write_synthetic`": "`ciassd data synth`",
 }

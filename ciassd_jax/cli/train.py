@@ -8,9 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
+import jax
 import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
+from ciassd_jax.cli.initial_weights import describe_taken, find_unloaded
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, values_from_options, warnings_as_lines
 from ciassd_jax.cli.options import Dtype, Frames, Unset
 from ciassd_jax.config import Config, ScheduleConfig
@@ -19,8 +21,10 @@ from ciassd_jax.data.gt_sampling import ObjectDatabase, database_path, find_data
 from ciassd_jax.data.loader import Batches, make_batches
 from ciassd_jax.data.scenes import check_targets
 from ciassd_jax.data.workers import WorkerError
+from ciassd_jax.formats.errors import warn_of_file
 from ciassd_jax.formats.writing import check_folder
-from ciassd_jax.inference.weights import check_fits, find_weights, load_weights
+from ciassd_jax.inference.weights import find_weights, load_weights, read_config
+from ciassd_jax.model.frozen import check_frozen
 from ciassd_jax.training.distributed import ParallelError, connect, is_process_0, on_process_0, shard
 from ciassd_jax.training.loop import Intervals, TrainingError, fit
 from ciassd_jax.training.validation import count_found
@@ -49,7 +53,11 @@ class Train:
     validate: str = "val"
     """The split to evaluate on; none for no evaluation."""
     init_from: Unset[Path] = None
-    """Weights to start from: a weights file (.safetensors, or a released .pth), or the name of bundled weights."""
+    """Weights to start from, by default with their config: a .safetensors, a released .pth, or bundled ones by name."""
+    partial: bool = False
+    """Take the tensors of --init-from that fit the config, for other classes or another range; draw the others."""
+    freeze: Annotated[Unset[tuple[str, ...]], tyro.conf.arg(metavar="PART ...")] = None
+    """Parts of the network that keep their parameters and statistics, such as backbone or neck/spatial_0."""
     overfit_one: Unset[str] = None
     """Train on this frame alone without augmentation, to check that the model can overfit it; exit code 1 if not."""
     seed: int = 0
@@ -115,7 +123,7 @@ class Train:
             raise UsageError(
                 f"Frame {self.overfit_one} has no target to overfit; name another frame, or another range."
             )
-        variables = self._variables(config)
+        variables = self._variables(config, log)
         batches = self._batches(dataset, config, self._database(dataset, config, folder, log))
         fitted = fit(
             config,
@@ -139,14 +147,20 @@ class Train:
         """The chosen config with the fields that are given as options."""
         if self.steps is not None and self.epochs is not None:
             raise UsageError("Give either --steps or --epochs.")
+        if self.partial and self.init_from is None:
+            raise UsageError("--partial takes what fits of the weights of --init-from; give both.")
         given = {f"schedule.{one.name}": getattr(self, one.name, None) for one in fields(ScheduleConfig)}
-        given |= {"dtype": self.dtype, "schedule.total_steps": self.steps}
+        given |= {"dtype": self.dtype, "schedule.total_steps": self.steps, "schedule.frozen": self.freeze}
         usual = _OVERFIT if self.overfit_one is not None else None
-        config = self.config_options.resolve(short=given, usual=usual)
-        if self.epochs is None:
-            return config
-        steps = self.epochs * frames // config.schedule.batch_size
-        return self.config_options.resolve(short=given | {"schedule.total_steps": steps}, usual=usual)
+        own = read_config(find_weights(self.init_from)) if self.init_from is not None else None
+        config = self.config_options.resolve(own, given, usual)
+        if self.epochs is not None:
+            steps = self.epochs * frames // config.schedule.batch_size
+            config = self.config_options.resolve(own, given | {"schedule.total_steps": steps}, usual)
+        if config.schedule.frozen:
+            with values_from_options():
+                check_frozen(config)
+        return config
 
     def _intervals(self) -> Intervals:
         with values_from_options():
@@ -185,12 +199,16 @@ class Train:
         # Process 0 may have to build it; the others then open it.
         return on_process_0(find) or find()
 
-    def _variables(self, config: Config) -> Variables | None:
-        if self.init_from is None:
-            return None
-        weights = load_weights(find_weights(self.init_from))
-        check_fits(weights, config, self.init_from)
-        return weights.variables
+    def _variables(self, config: Config, log: Callable[[str], object]) -> Variables | None:
+        weights = None
+        if self.init_from is not None:
+            weights = load_weights(find_weights(self.init_from), config, self.partial, jax.random.key(self.seed))
+        resumed = any(path.name.isdecimal() for path in self.workdir.glob("checkpoints/*"))
+        if self.partial and weights is not None and not resumed:
+            log(f"Taken from {self.init_from}:\n{describe_taken(weights.report)}")
+        if not resumed and (parts := find_unloaded(config.schedule.frozen, weights)):
+            warn_of_file(f"{', '.join(parts)}: frozen with random parameters, as no weights were loaded for all of it.")
+        return None if weights is None else weights.variables
 
     def _report_overfit(self, state: TrainState, dataset: Dataset, config: Config, log: Callable[[str], object]) -> int:
         found, targets = on_process_0(partial(count_found, state, dataset, config)) or (0, 0)

@@ -29,7 +29,7 @@ from ciassd_jax.inference.released_weights import (
     released_rules,
     released_tensors,
 )
-from ciassd_jax.model.network import variable_shapes
+from ciassd_jax.model.network import init_variables, variable_shapes
 from ciassd_jax.types import Variables
 
 FORMAT = "ciassd_jax weights 1"
@@ -37,35 +37,49 @@ BUNDLED = Path(__file__).parents[1] / "bundled"
 
 
 class TensorReport(NamedTuple):
-    """The name of a tensor in the file and here, its shape in the file, and its status.
+    """The name of a tensor in the file and here, its shape in both (None where it is absent), and its status.
 
-    The status is "mapped" (used as it is), "transposed" or "counter" (not needed). A file with any other is refused.
+    The status is "mapped" (used as it is), "transposed" or "counter" (not needed); in a partial load also "fresh: not
+    in the file", "fresh: other shape" or "left: not in the config".
     """
 
     source: str
     target: str
-    shape: tuple[int, ...]
+    shape: tuple[int, ...] | None
+    expected: tuple[int, ...] | None
     status: str
 
 
 class Weights(NamedTuple):
-    """Variables, their config, and a report on each tensor of the file."""
+    """Variables, their config, and a report on each tensor of the file and of the config."""
 
     variables: Variables
     config: Config
     report: list[TensorReport]
 
 
-def load_weights(path: str | os.PathLike[str]) -> Weights:
+class _File(NamedTuple):
+    """The tensors of a file, their names here, and the config that it was written for."""
+
+    tensors: Tensors
+    rules: Rules
+    config: Config
+
+
+def load_weights(
+    path: str | os.PathLike[str], config: Config | None = None, partial: bool = False, key: jax.Array | None = None
+) -> Weights:
     """Read a `.safetensors` file of this package, or a released `.pth`.
 
-    Raises InputError if the file lacks a tensor or has another one, and for a wrong shape or a value that is not
-    finite.
+    The tensors must be exactly those of `config`, by default the file's own. With `partial`, those whose name and shape
+    fit are taken, and the others are drawn from `key` (by default `jax.random.key(0)`) as by `init_variables`; the
+    report says which.
+
+    Raises InputError for a file that cannot be read, tensors that do not fit, and values that are not finite.
     """
-    if Path(path).suffix != ".safetensors":
-        return _load_released(read_torch_file(path), path)
-    tensors, metadata = _read_safetensors(path)
-    return _assemble(tensors, {name: (name, ()) for name in tensors}, _config_in(metadata, path), path)
+    if partial and config is None:
+        raise ValueError("`partial` loads the tensors that fit a `config`; give both.")
+    return _assemble(_read(path), path, config, partial, key)
 
 
 def read_config(path: str | os.PathLike[str]) -> Config:
@@ -82,7 +96,7 @@ def read_config(path: str | os.PathLike[str]) -> Config:
         except ValueError as error:
             raise InputError(f"{path} is not a config: {error}") from error
     if suffix != ".safetensors":
-        return load_weights(path).config
+        return _read(path).config
     return _config_in(_read_safetensors(path)[1], path)
 
 
@@ -92,11 +106,11 @@ def load_released_weights(path: str | os.PathLike[str]) -> Weights:
     Raises InputError for any other file.
     """
     if Path(path).suffix != ".safetensors":
-        return _load_released(read_torch_file(path), path)
+        return _assemble(_read(path), path)
     tensors, metadata = _read_safetensors(path)
     if "config" in metadata:
         raise InputError(f"{path} is already a weights file of this package; use it as it is.")
-    return _load_released(tensors, path)
+    return _assemble(_released(tensors, path), path)
 
 
 def save_weights(
@@ -107,7 +121,7 @@ def save_weights(
     Tensors are float32. `half_kernels` stores the kernels as float16, which halves the file. Raises InputError for a
     kernel that exceeds float16, and for a file that cannot be written.
     """
-    flat = {_name(keys): np.asarray(leaf) for keys, leaf in _leaves(variables)}
+    flat = {name: np.asarray(leaf) for name, leaf in _flat(variables).items()}
     if half_kernels:
         largest = float(np.finfo(np.float16).max)
         for name in [name for name in flat if name.endswith("/kernel")]:
@@ -133,18 +147,16 @@ def find_weights(path_or_name: str | os.PathLike[str]) -> Path:
     return BUNDLED / f"{path.name}.safetensors"
 
 
-def check_fits(weights: Weights, config: Config, path: str | os.PathLike[str]) -> None:
-    """Raise InputError unless the weights have exactly the parameters of `config`."""
-    given = {_name(keys): np.shape(leaf) for keys, leaf in _leaves(weights.variables)}
-    expected = _expected_shapes(config)
-    wrong = sorted(name for name in given.keys() | expected.keys() if given.get(name) != expected.get(name))
-    if wrong:
-        name = wrong[0]
-        raise InputError(
-            f"{path} holds weights for another config: {name} is {given.get(name, 'absent')} in the file and "
-            f"{expected.get(name, 'absent')} in the config ({len(wrong)} tensors differ); use the config of the file, "
-            "or other weights."
-        )
+def _read(path: str | os.PathLike[str]) -> _File:
+    if Path(path).suffix != ".safetensors":
+        return _released(read_torch_file(path), path)
+    tensors, metadata = _read_safetensors(path)
+    return _File(tensors, {name: (name, ()) for name in tensors}, _config_in(metadata, path))
+
+
+def _released(content: Mapping[str, Any], path: str | os.PathLike[str]) -> _File:
+    tensors = released_tensors(content, path)
+    return _File(tensors, released_rules(tensors, path), released_config(tensors))
 
 
 def _read_safetensors(path: str | os.PathLike[str]) -> tuple[Tensors, dict[str, str]]:
@@ -169,40 +181,67 @@ def _config_in(metadata: Mapping[str, str], path: str | os.PathLike[str]) -> Con
         raise InputError(f"{path} was written for another version of the package: {error}") from error
 
 
-def _load_released(content: Mapping[str, Any], path: str | os.PathLike[str]) -> Weights:
-    tensors = released_tensors(content, path)
-    return _assemble(tensors, released_rules(tensors, path), released_config(tensors), path)
+def _assemble(
+    file: _File,
+    path: str | os.PathLike[str],
+    config: Config | None = None,
+    partial: bool = False,
+    key: jax.Array | None = None,
+) -> Weights:
+    """Rename, transpose and nest the tensors that fit; refuse any other unless `partial`."""
+    chosen = config or file.config
+    shapes = {name: leaf.shape for name, leaf in _flat(variable_shapes(chosen.for_inference())).items()}
+    report, found = _match(file, shapes)
+    if bad := [row.source for row in report if row.status == "not finite"]:
+        raise InputError(f"{path} has values that are not finite in {_some(bad)}; give other weights.")
+    misfits = [row for row in report if row.status.startswith(("fresh", "left"))]
+    some = _some([_describe(row) for row in misfits])
+    if misfits and not partial:
+        misfit = f"{len(misfits)} of {len(report)} tensors: {some}"
+        if config is None:
+            raise InputError(f"{path} does not fit its model in {misfit}; give the complete file.")
+        raise InputError(
+            f"{path} does not fit the config in {misfit}; use the config of the file, or `partial` to take what fits."
+        )
+    if not found:
+        raise InputError(f"No tensor of {path} fits the config: {some}; use the config of the file, or other weights.")
+    if misfits:
+        found = _flat(init_variables(jax.random.key(0) if key is None else key, chosen)) | found
+    return Weights(_nest({name: np.ascontiguousarray(found[name], np.float32) for name in shapes}), chosen, report)
 
 
-def _assemble(tensors: Tensors, rules: Rules, config: Config, path: str | os.PathLike[str]) -> Weights:
-    """Rename, transpose and nest the tensors; raise InputError unless they are exactly those of the config."""
-    expected = _expected_shapes(config)
-    found: dict[str, np.ndarray] = {}
-    report = []
-    for source, value in tensors.items():
-        target, axes = rules.get(source, (source, ()))
+def _match(file: _File, shapes: Mapping[str, tuple[int, ...]]) -> tuple[list[TensorReport], dict[str, np.ndarray]]:
+    """Report on each tensor of the file and of the config, and return those that fit under their names here."""
+    report, found = [], {}
+    for source, value in file.tensors.items():
+        target, axes = file.rules.get(source, (source, ()))
         moved = axes != tuple(range(len(axes))) and value.ndim == len(axes)
-        found[target] = value.transpose(axes) if moved else value
+        array = value.transpose(axes) if moved else value
+        expected = shapes.get(target) if source in file.rules else None
         if not target:
             status = "counter"
-        elif source not in rules or target not in expected:
-            status = "unexpected"
-        elif found[target].shape != expected[target]:
-            status = f"shape differs, expected {expected[target]}"
         elif not np.isfinite(value).all():
             status = "not finite"
+        elif expected is None:
+            status = "left: not in the config"
+        elif array.shape != expected:
+            status = "fresh: other shape"
         else:
-            status = "transposed" if moved else "mapped"
-        report.append(TensorReport(source, target, value.shape, status))
-    report += [TensorReport("", name, shape, "missing") for name, shape in expected.items() if name not in found]
-    wrong = [row for row in report if row.status not in ("mapped", "transposed", "counter")]
-    if wrong:
-        shown = "; ".join(f"{row.source or row.target} {row.shape}: {row.status}" for row in wrong[:3])
-        raise InputError(
-            f"{path} does not fit its model in {len(wrong)} of {len(report)} tensors ({shown}); "
-            "give the complete file that belongs to this config."
-        )
-    return Weights(_nest({name: np.ascontiguousarray(found[name], np.float32) for name in expected}), config, report)
+            status, found[target] = "transposed" if moved else "mapped", array
+        report.append(TensorReport(source, target, value.shape, expected, status))
+    reported = {row.target for row in report if row.expected is not None}
+    absent = [name for name in shapes if name not in reported]
+    return report + [TensorReport("", name, None, shapes[name], "fresh: not in the file") for name in absent], found
+
+
+def _describe(row: TensorReport) -> str:
+    here, there = ("absent" if shape is None else shape for shape in (row.expected, row.shape))
+    return f"{row.source or row.target} is {there} in the file and {here} in the config"
+
+
+def _some(texts: list[str]) -> str:
+    """The first three texts."""
+    return ", ".join(texts[:3]) + (", ..." if len(texts) > 3 else "")
 
 
 def _nest(flat: dict[str, np.ndarray]) -> Variables:
@@ -217,13 +256,6 @@ def _nest(flat: dict[str, np.ndarray]) -> Variables:
     return nested
 
 
-def _expected_shapes(config: Config) -> dict[str, tuple[int, ...]]:
-    return {_name(keys): leaf.shape for keys, leaf in _leaves(variable_shapes(config.for_inference()))}
-
-
-def _leaves(tree: Variables) -> list[tuple[tuple, Any]]:
-    return jax.tree_util.tree_flatten_with_path(tree)[0]
-
-
-def _name(keys: tuple) -> str:
-    return "/".join(key.key for key in keys)
+def _flat(tree: Variables) -> dict[str, Any]:
+    """Return the leaves by names like `params/head/box/kernel`."""
+    return {"/".join(key.key for key in keys): leaf for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}

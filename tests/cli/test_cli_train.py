@@ -126,6 +126,101 @@ def test_starts_from_weights(run: Callable[..., Run], fits: list[tuple[Any, ...]
     jax.tree.map(np.testing.assert_array_equal, options["variables"], random_variables(mini_config(), seed=5))
 
 
+def test_without_a_config_that_of_the_weights_is_used(
+    run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path
+) -> None:
+    own = replace(mini_config(), schedule=replace(mini_config().schedule, learning_rate=0.25, frozen=("backbone",)))
+    save_weights(tmp_path / "w.safetensors", random_variables(own), own)
+    options = {"init-from": tmp_path / "w.safetensors", "preset": None, "steps": None}
+    assert run("--config.schedule.warmup", "0.5", workdir=tmp_path / "run", **options).code == 0
+    assert run("--freeze", workdir=tmp_path / "thawed", **options).code == 0
+    (config, _, _), (thawed, _, _) = fits
+    assert config == replace(own, schedule=replace(own.schedule, warmup=0.5))
+    assert thawed == replace(own, schedule=replace(own.schedule, frozen=()))
+
+
+@pytest.fixture
+def other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Weights of a network that has another head, and a tensor more; what they lack is not drawn by a program."""
+    monkeypatch.setattr("ciassd_jax.inference.weights.init_variables", lambda key, config: random_variables(config))
+    given = mini_config()
+    config = replace(given, classes=(given.classes[0], replace(given.classes[0], name="Van")))
+    variables = random_variables(config, seed=5)
+    variables = variables | {"params": variables["params"] | {"extra": {"scale": np.zeros(3, np.float32)}}}
+    save_weights(tmp_path / "other.safetensors", variables, config)
+    return tmp_path / "other.safetensors"
+
+
+def test_weights_that_do_not_fit_are_refused_and_the_remedy_works(
+    run: Callable[..., Run], fits: list[tuple[Any, ...]], other: Path, tmp_path: Path
+) -> None:
+    refused = run(workdir=tmp_path / "w", **{"init-from": other})
+    assert refused.code == 2
+    assert refused.err.count("\n") == 1
+    assert "does not fit the config in 9 of 99 tensors: " in refused.err
+    assert "`ciassd train --init-from FILE --partial` to take what fits" in refused.err
+    assert not (tmp_path / "w").exists()
+    done = run("--partial", workdir=tmp_path / "w", **{"init-from": other})
+    assert done.code == 0, done.err
+    lines = [re.sub(" +", " ", line).strip() for line in done.out.splitlines()]
+    assert "backbone 20 of 20 tensors" in lines
+    assert "head 0 of 8 tensors" in lines
+    assert "params/head/box/bias fresh: other shape file (28,) config (14,)" in lines
+    assert "params/extra/scale left: not in the config file (3,) config absent" in lines
+    ((config, _, options),) = fits
+    assert config.class_names == ("Car",)
+    given = random_variables(config, seed=5)["params"]["backbone"]
+    jax.tree.map(np.testing.assert_array_equal, options["variables"]["params"]["backbone"], given)
+
+
+def test_partial_needs_weights(run: Callable[..., Run], tmp_path: Path) -> None:
+    refused = run("--partial", workdir=tmp_path / "w")
+    assert refused.code == 2
+    assert refused.err == "error: --partial takes what fits of the weights of --init-from; give both.\n"
+
+
+def test_a_resumed_training_takes_no_weights(
+    run: Callable[..., Run], fits: list[tuple[Any, ...]], other: Path, begun: Path
+) -> None:
+    done = run("--partial", "--freeze", "head", workdir=begun, **{"init-from": other})
+    assert (done.code, done.err) == (0, "")
+    assert "fresh" not in done.out
+
+
+@pytest.mark.parametrize(
+    ("options", "warned"),
+    [
+        (("--freeze", "backbone", "head/box"), "backbone, head/box"),
+        (("--freeze", "backbone", "head/box", "--partial"), "head/box"),
+        (("--freeze", "backbone", "--partial"), ""),
+    ],
+)
+def test_frozen_parts_go_to_the_config_and_random_ones_are_told(
+    run: Callable[..., Run],
+    fits: list[tuple[Any, ...]],
+    other: Path,
+    tmp_path: Path,
+    options: tuple[str, ...],
+    warned: str,
+) -> None:
+    start = {"init-from": other} if "--partial" in options else {}
+    done = run(*options, workdir=tmp_path / "w", **start)
+    assert done.code == 0, done.err
+    ((config, _, _),) = fits
+    assert config.schedule.frozen == tuple(one for one in options if not one.startswith("--"))
+    expected = f"warning: {warned}: frozen with random parameters, as no weights were loaded for all of it.\n"
+    assert done.err == (expected if warned else "")
+
+
+def test_an_unknown_part_is_refused_with_the_names_of_the_parts(
+    run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path
+) -> None:
+    refused = run("--freeze", "bakbone", workdir=tmp_path / "w")
+    assert refused.code == 2
+    assert re.fullmatch(r"error: schedule\.frozen .*'bakbone'; its parts are backbone, .*neck/.*\n", refused.err)
+    assert not fits
+
+
 def test_overfit_one_takes_that_frame_alone_and_reports(
     run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path
 ) -> None:

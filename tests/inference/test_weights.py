@@ -14,9 +14,9 @@ import safetensors.numpy
 from released import LAYOUTS, State, released_state, write_pth
 from small import random_variables, small_config
 
-from ciassd_jax import car_lite, car_released
+from ciassd_jax import Config, car_lite, car_released, init_variables
 from ciassd_jax.formats.errors import InputError
-from ciassd_jax.inference.weights import check_fits, load_released_weights, load_weights, save_weights
+from ciassd_jax.inference.weights import load_released_weights, load_weights, save_weights
 
 
 def released_file(folder: Path, state: State) -> Path:
@@ -90,16 +90,25 @@ NAME = "params/head/box/kernel"
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.pop(NAME), "head/box/kernel .* missing"),
-        (lambda t: t.update(extra=np.zeros(3, np.float32)), r"extra \(3,\): unexpected"),
-        (lambda t: t.update({NAME: t[NAME][..., :3]}), r"head/box/kernel .* shape differs, expected \(1, 1, 16, 14\)"),
-        (lambda t: t.update({NAME: t[NAME] * np.nan}), "head/box/kernel .* not finite"),
+        (lambda t: t.pop(NAME), r"head/box/kernel is absent in the file and \(1, 1, 16, 14\) in the config"),
+        (lambda t: t.update(extra=np.zeros(3, np.float32)), r"extra is \(3,\) in the file and absent in the config"),
+        (
+            lambda t: t.update({NAME: t[NAME][..., :3]}),
+            r"\(1, 1, 16, 3\) in the file and \(1, 1, 16, 14\) in the config",
+        ),
     ],
-    ids=["missing", "unexpected", "shape", "not finite"],
+    ids=["missing", "unexpected", "shape"],
 )
 def test_our_file_must_fit_exactly(ours: Path, change: Any, message: str) -> None:
-    with pytest.raises(InputError, match=f"does not fit its model in 1 of .*{message}.*; give the complete file"):
+    with pytest.raises(InputError, match=f"does not fit its model in 1 of .*{message}; give the complete file"):
         load_weights(edit(ours, change))
+
+
+def test_values_that_are_not_finite_are_refused(ours: Path) -> None:
+    edit(ours, lambda tensors: tensors.update({NAME: tensors[NAME] * np.nan}))
+    for options in ({}, {"config": three_classes(), "partial": True}):
+        with pytest.raises(InputError, match=f"not finite in {NAME}; give other weights"):
+            load_weights(ours, **options)
 
 
 @pytest.mark.parametrize(("name", "words"), [("novelty", "known are backbone"), ("scedule", "did you mean 'schedule'")])
@@ -161,11 +170,77 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
             load_weights(tmp_path / name)
 
 
-def test_check_fits_names_a_tensor_that_differs(ours: Path) -> None:
-    weights = load_weights(ours)
-    check_fits(weights, replace(small_config(), dtype="bfloat16"), ours)
-    with pytest.raises(InputError, match=r"ours\.safetensors .*: \S+/\S+ is .* \(\d+ tensors differ\); use the config"):
-        check_fits(weights, car_released(), ours)
+def three_classes() -> Config:
+    config = small_config()
+    return replace(config, classes=tuple(replace(config.classes[0], name=name) for name in ("Car", "Van", "Truck")))
+
+
+def flat(variables: Any) -> dict[str, np.ndarray]:
+    leaves = jax.tree_util.tree_flatten_with_path(variables)[0]
+    return {"/".join(key.key for key in keys): leaf for keys, leaf in leaves}
+
+
+def test_the_config_may_be_another_of_the_same_tensors(ours: Path) -> None:
+    config = replace(small_config(), dtype="bfloat16")
+    loaded = load_weights(ours, config)
+    assert loaded.config == config
+    assert_same(loaded.variables, random_variables(small_config()))
+
+
+def test_a_config_of_other_tensors_is_refused(ours: Path) -> None:
+    message = (
+        r"ours\.safetensors does not fit the config in 8 of 98 tensors: params/head/\S+ is .*; use .* or `partial`"
+    )
+    with pytest.raises(InputError, match=message):
+        load_weights(ours, three_classes())
+
+
+def test_a_partial_load_takes_what_fits_and_draws_the_rest(ours: Path) -> None:
+    config = three_classes()
+    edit(ours, lambda tensors: tensors.update(extra=np.zeros(3, np.float32)) or tensors.pop("params/head/iou/bias"))
+    loaded = load_weights(ours, config, partial=True, key=jax.random.key(3))
+    assert loaded.config == config
+    given, fresh = flat(random_variables(small_config())), flat(init_variables(jax.random.key(3), config))
+    found = flat(loaded.variables)
+    assert found.keys() == fresh.keys()
+    for name, leaf in found.items():
+        np.testing.assert_array_equal(leaf, fresh[name] if "/head/" in name else given[name])
+    rows = {row.target: row for row in loaded.report}
+    assert rows.keys() == found.keys() | {"extra"}
+    assert {row.status for name, row in rows.items() if "/head/" not in name and name != "extra"} == {"mapped"}
+    assert rows[NAME] == (NAME, NAME, (1, 1, 16, 14), (1, 1, 16, 42), "fresh: other shape")
+    assert rows["params/head/iou/bias"] == ("", "params/head/iou/bias", None, (6,), "fresh: not in the file")
+    assert rows["extra"] == ("extra", "extra", (3,), None, "left: not in the config")
+
+
+def test_a_partial_load_of_a_released_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def draw(key: jax.Array, config: Config) -> Any:
+        assert key == jax.random.key(0)
+        return random_variables(config)
+
+    monkeypatch.setattr("ciassd_jax.inference.weights.init_variables", draw)
+    state = released_state()
+    config = replace(car_released(), head=replace(car_released().head, iou_kernel=1, iou_bias=True))
+    loaded = load_weights(write_pth(tmp_path / "released.pth", {"state_dict": state}), config, partial=True)
+    whole = flat(load_released_weights(released_file(tmp_path, state)).variables)
+    assert {row.target: row.status for row in loaded.report if row.status.startswith("fresh")} == {
+        "params/head/iou/kernel": "fresh: other shape",
+        "params/head/iou/bias": "fresh: not in the file",
+    }
+    for name, leaf in flat(loaded.variables).items():
+        if "/iou/" not in name:
+            np.testing.assert_array_equal(leaf, whole[name])
+
+
+def test_a_partial_load_where_nothing_fits_is_refused(ours: Path) -> None:
+    edit(ours, lambda tensors: [tensors.update({name: tensors[name][None]}) for name in tensors])
+    with pytest.raises(InputError, match=r"No tensor of .*ours\.safetensors fits the config: .*; use the config of"):
+        load_weights(ours, three_classes(), partial=True)
+
+
+def test_a_partial_load_needs_a_config(ours: Path) -> None:
+    with pytest.raises(ValueError, match=r"`partial` .* `config`; give both"):
+        load_weights(ours, partial=True)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -210,12 +285,12 @@ def test_released_pth_of_both_formats(tmp_path: Path, legacy: bool, wrapped: boo
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda s: s.pop("neck.w_0.0.weight"), "neck/spatial_attention/kernel .*: missing"),
-        (lambda s: s.update({"neck.w_9.weight": np.zeros(1, np.float32)}), r"neck\.w_9\.weight \(1,\): unexpected"),
-        (lambda s: s.pop("bbox_head.tasks.0.conv_iou.weight"), "head/iou/kernel .*: missing"),
+        (lambda s: s.pop("neck.w_0.0.weight"), "neck/spatial_attention/kernel is absent in the file"),
+        (lambda s: s.update({"neck.w_9.weight": np.zeros(1, np.float32)}), r"neck\.w_9\.weight is \(1,\) in the file"),
+        (lambda s: s.pop("bbox_head.tasks.0.conv_iou.weight"), "head/iou/kernel is absent in the file"),
         (
             lambda s: s.update({"neck.conv_0.0.weight": s["neck.conv_0.0.weight"][:, :64]}),
-            r"neck\.conv_0\.0\.weight \(128, 64, 3, 3\): shape differs, expected \(3, 3, 128, 128\)",
+            r"neck\.conv_0\.0\.weight is \(128, 64, 3, 3\) in the file and \(3, 3, 128, 128\) in the config",
         ),
     ],
     ids=["missing", "unexpected", "no iou head", "shape"],
