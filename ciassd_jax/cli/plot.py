@@ -19,7 +19,7 @@ from ciassd_jax.view.curves import plot_curves
 class Plot:
     """Draw the curves of trainings: loss and its terms, learning rate, positive anchors, validation scores."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN ...")]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN ...", help_behavior_hint="")]
     """The folder of a training, finished or not, or of several to compare."""
     out: Annotated[Unset[Path], tyro.conf.arg(metavar="FILE.png")] = None
     """The picture to write; by default curves.png in the folder of the first training."""

@@ -33,7 +33,7 @@ def plot_curves(runs: Mapping[str, Lines]) -> Figure:
     """Return a picture of the lines of metrics.jsonl of runs by name, with one panel per quantity over the steps.
 
     The quantities are the loss and its terms, the learning rate, the positive anchors, and the AP of each class on the
-    validation frames; those that no run has are left out. A curve has a gap where its number was not finite. Raises
+    validation frames with their mean, the score; those that no run has are left out. A curve has a gap where its number was not finite. Raises
     ModuleNotFoundError without matplotlib.
     """
     panels = {title: {name: ""} for name, title in _TITLES.items()} | _precisions(runs.values())
@@ -59,7 +59,8 @@ def _precisions(runs: Iterable[Lines]) -> dict[str, dict[str, str]]:
             metric, limit, level, recall = parts
             title = f"AP of {kind}, {level}, {recall} (%)"
             panels.setdefault(title, {})[name] = f"{metric.upper()} at {limit}"
-    return panels
+    mean = {"validation score: mean 3D AP (%)": {"score": ""}} if len(panels) > 1 else {}
+    return mean | panels
 
 
 def _has(lines: Lines, names: Iterable[str]) -> bool:
@@ -75,16 +76,23 @@ def _draw(axes: Axes, lines: Lines, name: str, color: str, style: str) -> None:
 
 
 def _dress(axes: Axes, title: str, names: Mapping[str, str]) -> None:
-    """The title, a light grid, a logarithmic scale for losses, and what each style of line is."""
+    """The title, a light grid, a logarithmic scale for a loss that falls far, and what each style of line is."""
     from matplotlib.lines import Line2D
+    from matplotlib.ticker import LogLocator
 
     axes.set_title(title, fontsize=10, loc="left")
     axes.set_xlabel("step", fontsize=8)
-    axes.tick_params(labelsize=8)
+    axes.tick_params(labelsize=8, which="both")
     axes.grid(color="#ebebe8", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
-    if title.endswith("loss"):
-        axes.set_yscale("log", nonpositive="mask")
+    low, high = axes.dataLim.intervaly
+    if title.endswith("loss") and high > 10 * low > 0:
+        axes.set_yscale("log")
+        axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
+    if title.endswith("(%)"):
+        axes.set_ylim(0, max(1, axes.get_ylim()[1]))
     if len(names) > 1:
         handles = [
             Line2D([], [], color="black", linestyle=style, linewidth=1.3, label=label)
