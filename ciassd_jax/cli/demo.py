@@ -11,14 +11,14 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
-from ciassd_jax.cli.options import Columns, open_simulated, read_columns
+from ciassd_jax.cli.options import Columns, MinScore, ScoreThreshold, open_simulated, read_columns
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.formats.writing import check_folder, replacing
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.results import write_json
-from ciassd_jax.view.bev import plot_bev
+from ciassd_jax.view.bev import plot_frame
 from ciassd_jax.view.html import view_html
-from ciassd_jax.view.view_frame import ViewFrame, frame_to_view
+from ciassd_jax.view.view_frame import ViewFrame, frame_to_view, mark_targets
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,16 @@ class Demo:
     seed: int = 0
     """Seed of the streets."""
     columns: Columns = None
+    score_threshold: ScoreThreshold = None
+    min_score: MinScore = None
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 
     def run(self) -> int:
         if self.scenes < 1:
             raise UsageError(f"--scenes {self.scenes} shows nothing; ask for at least 1.")
         with warnings_as_lines(self.file or "simulated street"):
-            weights = self.config_options.load(self.weights)
+            short = {"detection.score_threshold": self.score_threshold, "detection.min_score": self.min_score}
+            weights = self.config_options.load(self.weights, short)
             check_folder(self.out)
             frames = self._frames()
             detector = Detector(weights.variables, weights.config)
@@ -53,7 +56,7 @@ class Demo:
                 result = detector(frame.points, source=self.file or frame.name)
                 objects = "" if self.file else f", {len(frame.truth)} labelled objects"
                 print(f"\n{frame.name}: {len(frame.points)} points{objects}\n{result}", flush=True)
-                shown.append(result.show_in(frame))
+                shown.append(result.show_in(mark_targets(frame, weights.config)))
                 written.append(write_json(self.out / f"{frame.name}.json", result))
             print()
             for draw in (_draw_pictures, _draw_page):
@@ -86,10 +89,8 @@ def _draw_pictures(frames: Sequence[ViewFrame], out: Path) -> list[Path]:
     """A picture from above of every frame."""
     paths = [out / f"{frame.name}.png" for frame in frames]
     for frame, path in zip(frames, paths, strict=True):
-        truth = frame.truth if len(frame.truth) else None
-        figure = plot_bev(frame.points, frame.boxes, truth, frame.scores, frame.labels, title=frame.name)
         with replacing(path) as temporary:
-            figure.savefig(temporary, format="png")
+            plot_frame(frame).savefig(temporary, format="png")
     return paths
 
 

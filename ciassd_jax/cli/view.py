@@ -13,7 +13,16 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
-from ciassd_jax.cli.options import SIMULATED, Columns, ImageSize, Unset, open_simulated, read_columns
+from ciassd_jax.cli.options import (
+    SIMULATED,
+    Columns,
+    ImageSize,
+    MinScore,
+    ScoreThreshold,
+    Unset,
+    open_simulated,
+    read_columns,
+)
 from ciassd_jax.formats.errors import FormatWarning, InputError, warn_of_file
 from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.points import check_intensity
@@ -21,7 +30,7 @@ from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.view.html import view_html
 from ciassd_jax.view.sources import Source, add_saved, dataset_sources, detector_points, find_sources, read_source
-from ciassd_jax.view.view_frame import ViewFrame
+from ciassd_jax.view.view_frame import ViewFrame, mark_targets
 from ciassd_jax.view.viz_extra import require
 
 
@@ -49,6 +58,8 @@ class View:
     """Also show the camera's image, with the boxes projected into it."""
     image_size: ImageSize = None
     columns: Columns = None
+    score_threshold: ScoreThreshold = None
+    min_score: MinScore = None
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 
     def run(self) -> int:
@@ -70,6 +81,10 @@ class View:
             raise UsageError(str(error)) from error
         if self.weights and self.results:
             raise UsageError("--weights detects objects and --results shows saved detections; give one of them.")
+        if self.score_threshold is not None and not self.weights:
+            raise UsageError("--score-threshold is for detecting; give --weights too, or use --min-score.")
+        if self.min_score is not None and not (self.weights or self.results):
+            raise UsageError("--min-score is for detections; give --weights or --results too.")
         if self.frames < 1:
             raise UsageError(f"--frames {self.frames} shows nothing; ask for at least 1.")
         if self.out.suffix.lower() not in (".html", ".htm"):
@@ -82,17 +97,22 @@ class View:
         sources = self._choose(self._sources())
         if self.image and not any(source.image for source in sources.values()):
             raise UsageError(f"{self.path} has no images; leave out --image.")
-        weights = self.config_options.load(self.weights) if self.weights else None
-        config = weights.config if weights else self.config_options.resolve()
+        short = {"detection.score_threshold": self.score_threshold, "detection.min_score": self.min_score}
+        weights = self.config_options.load(self.weights, short) if self.weights else None
+        config = weights.config if weights else self.config_options.resolve(short=short)
         frames = [read_source(sources[name], image=self.image) for name in frames_with_bar(list(sources))]
         if weights is not None:
             detector = Detector(weights.variables, config)
             if cropped := sum(frame.whole and frame.camera is not None for frame in frames):
                 print(f"In {cropped} whole clouds the detector gets the points that the camera sees, as in evaluation.")
-            return [_detect(detector, frame) for frame in frames_with_bar(frames)]
+            return [mark_targets(_detect(detector, frame), config) for frame in frames_with_bar(frames)]
         for frame in frames:
             _check_intensity(frame, config.input.intensity_scale)
-        return frames if self.results is None else _add_saved(frames, self.results)
+        if self.config_options.preset or self.config_options.config:
+            frames = [mark_targets(frame, config) for frame in frames]
+        return (
+            frames if self.results is None else _add_saved(frames, self.results, config.detection.min_score or -np.inf)
+        )
 
     def _sources(self) -> dict[str, Source]:
         if self.path != SIMULATED:
@@ -129,9 +149,9 @@ def _check_intensity(frame: ViewFrame, scale: float) -> None:
         warn_of_file(f"{frame.name}: {clipped} intensities lie outside [0, {scale:g}].", frame.name)
 
 
-def _add_saved(frames: Sequence[ViewFrame], folder: Path) -> list[ViewFrame]:
-    """The frames with their saved detections; warns of the number of frames without any."""
-    found = [add_saved(frame, folder) for frame in frames]
+def _add_saved(frames: Sequence[ViewFrame], folder: Path, min_score: float) -> list[ViewFrame]:
+    """The frames with their saved detections from this score; warns of the number of frames without any."""
+    found = [add_saved(frame, folder, min_score) for frame in frames]
     lacking = [frame.name for frame, with_saved in zip(frames, found, strict=True) if with_saved is None]
     if len(lacking) == len(frames):
         raise InputError(

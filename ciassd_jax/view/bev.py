@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ciassd_jax.ops.footprints import footprint_corners
 from ciassd_jax.types import Boxes
 from ciassd_jax.view.outlines import HEADING
-from ciassd_jax.view.picture import FOUND, TRUTH, captions_of, new_picture
+from ciassd_jax.view.picture import DIMMED, DIMMED_MEANING, FOUND, TRUTH, captions_of, new_picture
 from ciassd_jax.view.sampling import choose_boxes, choose_points
+from ciassd_jax.view.view_frame import SCORE_MEANING, ViewFrame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,38 +34,61 @@ def plot_bev(
     scores: Float[np.ndarray, " D"] | None = None,
     labels: Sequence[str] | None = None,
     *,
+    truth_labels: Sequence[str] | None = None,
+    is_target: Bool[np.ndarray, " G"] | None = None,
     x_limits: tuple[float, float] | None = None,
     y_limits: tuple[float, float] | None = None,
     title: str | None = None,
 ) -> Figure:
-    """Return a picture of points coloured by height, ground truth in red, and detections in green with their scores.
+    """Return a picture of points coloured by height, ground truth in red, and detections in green.
 
-    The first columns of `points` are x, y, z (metres); boxes are x, y, z, length, width, height, yaw. The default
-    limits, in metres, enclose every point and box ahead of the sensor. A note in the picture counts what is left out:
-    points and boxes that are not finite or farther than `sampling.FARTHEST`, and points beyond a million. Save the
-    picture with `figure.savefig(path)`. Raises ModuleNotFoundError without matplotlib.
+    The first columns of `points` are x, y, z (metres); boxes are x, y, z, length, width, height, yaw. A caption has the
+    class of a box and its score, beside true boxes and above detected ones. True boxes that are not `is_target` are
+    dimmed. The default limits, in metres, enclose every point and box ahead of the sensor. A note in the picture counts
+    what is left out: points and boxes that are not finite or farther than `sampling.FARTHEST`, and points beyond a
+    million. Save the picture with `figure.savefig(path)`. Raises ModuleNotFoundError without matplotlib.
     """
     visible, point_notes = choose_points(points, PICTURE_POINTS)
     boxes, truth = (np.zeros((0, 7)) if some is None else np.asarray(some, np.float64) for some in (boxes, truth))
     chosen, box_notes = choose_boxes(boxes, "detected boxes")
     chosen_truth, truth_notes = choose_boxes(truth, "true boxes")
     captions = captions_of(len(boxes), scores, labels)
-    boxes, truth = boxes[chosen], truth[chosen_truth]
+    true_captions = captions_of(len(truth), None, truth_labels)
+    targets = np.ones(len(truth), bool) if is_target is None else is_target
+    boxes, truth, targets = boxes[chosen], truth[chosen_truth], targets[chosen_truth]
     x_limits = x_limits or _span(visible, boxes, truth, 0)
     y_limits = y_limits or _span(visible, boxes, truth, 1)
     figure = new_picture(figsize=_figure_size(x_limits, y_limits), dpi=150, layout="constrained")
     axes = figure.add_subplot()
     _draw_points(axes, visible)
-    _draw_boxes(axes, truth, TRUTH, zorder=3)
+    _draw_boxes(axes, truth[~targets], DIMMED, zorder=3, width=0.9)
+    _draw_boxes(axes, truth[targets], TRUTH, zorder=3)
     _draw_boxes(axes, boxes, FOUND, zorder=4)
-    for index, box in zip(chosen, boxes, strict=True):
-        _caption(axes, box, captions[index])
+    names = [true_captions[index] for index in chosen_truth]
+    _write_captions(axes, truth, names, np.where(targets, "#a31515", "#a87573").tolist(), beside=True)
+    _write_captions(axes, boxes, [captions[index] for index in chosen], ["#0a6b22"] * len(boxes), beside=False)
     _dress(axes, x_limits, y_limits)
-    _legend(axes, len(boxes), len(truth))
+    _legend(axes, len(boxes), int(targets.sum()), int((~targets).sum()))
     axes.set_title(title or "", loc="left")
+    if scores is not None and len(scores):
+        axes.set_title(SCORE_MEANING, loc="right", fontsize=8, color="#555555")
     if notes := [*point_notes, *box_notes, *truth_notes]:
         axes.text(0.01, 0.01, "\n".join(notes), transform=axes.transAxes, fontsize=7, color="#555555", zorder=7)
     return figure
+
+
+def plot_frame(frame: ViewFrame) -> Figure:
+    """Return the picture of a frame (`plot_bev`), with its name as the title."""
+    return plot_bev(
+        frame.points,
+        frame.boxes,
+        frame.truth,
+        frame.scores,
+        frame.labels,
+        truth_labels=frame.truth_labels,
+        is_target=frame.is_target,
+        title=frame.name,
+    )
 
 
 def _draw_points(axes: Axes, points: Float[np.ndarray, "N 3"]) -> None:
@@ -85,34 +109,31 @@ def _footprints(boxes: Float[np.ndarray, "D 7"]) -> Float[np.ndarray, "D 5 2"]:
     return np.asarray(footprint_corners(Boxes.from_array(boxes)))[:, (0, 1, 2, 3, 0)]
 
 
-def _draw_boxes(axes: Axes, boxes: Float[np.ndarray, "D 7"], color: str, zorder: int) -> None:
+def _draw_boxes(axes: Axes, boxes: Float[np.ndarray, "D 7"], color: str, zorder: int, width: float = 1.6) -> None:
     """Outlines, and a line from each centre through the front."""
     from matplotlib.collections import LineCollection
 
     ahead = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], -1) * (boxes[:, 3:4] / 2 + HEADING)
     heading = boxes[:, None, :2] + np.stack([np.zeros_like(ahead), ahead], 1)
     for lines in (_footprints(boxes), heading):
-        axes.add_collection(LineCollection(list(lines), colors=color, linewidths=1.6, zorder=zorder))
+        axes.add_collection(LineCollection(list(lines), colors=color, linewidths=width, zorder=zorder))
 
 
-def _caption(axes: Axes, box: Float[np.ndarray, " 7"], text: str) -> None:
-    if not text:
-        return
-    top = _footprints(box[None])[0][:, 1].max()
-    box_style = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-    axes.annotate(
-        text,
-        (box[0], top),
-        xytext=(0, 3),
-        textcoords="offset points",
-        ha="center",
-        va="bottom",
-        color="#0a6b22",
-        fontsize=8,
-        bbox=box_style,
-        annotation_clip=True,
-        zorder=5,
-    )
+def _write_captions(
+    axes: Axes, boxes: Float[np.ndarray, "D 7"], texts: Sequence[str], colors: Sequence[str], *, beside: bool
+) -> None:
+    """A caption above each box, or smaller and beside it."""
+    from matplotlib.patheffects import withStroke
+
+    style: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 7, "xytext": (0, 2)}
+    if beside:
+        style = {"ha": "left", "va": "center", "fontsize": 6, "xytext": (3, 0)}
+    style |= {"path_effects": [withStroke(linewidth=2, foreground="white")], "annotation_clip": True, "zorder": 5}
+    for outline, text, color in zip(_footprints(boxes), texts, colors, strict=True):
+        (left, low), (right, high) = outline.min(0), outline.max(0)
+        at = (right, (low + high) / 2) if beside else ((left + right) / 2, high)
+        if text:
+            axes.annotate(text, at, textcoords="offset points", color=color, **style)
 
 
 def _span(points: np.ndarray, boxes: np.ndarray, truth: np.ndarray, axis: int) -> tuple[float, float]:
@@ -137,10 +158,11 @@ def _dress(axes: Axes, x_limits: tuple[float, float], y_limits: tuple[float, flo
     axes.plot(0, 0, marker=">", markersize=9, color="black", zorder=6, clip_on=True)
 
 
-def _legend(axes: Axes, found: int, truth: int) -> None:
+def _legend(axes: Axes, found: int, targets: int, others: int) -> None:
     from matplotlib.lines import Line2D
 
     handles = [Line2D([], [], color="black", marker=">", linestyle="none", label="sensor")]
-    handles += [Line2D([], [], color=TRUTH, linewidth=1.6, label=f"ground truth ({truth})")] * bool(truth)
+    handles += [Line2D([], [], color=TRUTH, linewidth=1.6, label=f"ground truth ({targets})")] * bool(targets)
+    handles += [Line2D([], [], color=DIMMED, linewidth=0.9, label=f"{DIMMED_MEANING} ({others})")] * bool(others)
     handles += [Line2D([], [], color=FOUND, linewidth=1.6, label=f"detected ({found})")]
     axes.legend(handles=handles, loc="upper right", framealpha=0.9, fontsize=9)

@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from ciassd_jax.formats.errors import DroppedWarning, Pathlike
 from ciassd_jax.formats.kitti_camera import lidar_to_image
 from ciassd_jax.formats.writing import write_text
 from ciassd_jax.view.outlines import outline_boxes, project_segments
 from ciassd_jax.view.sampling import choose_boxes, choose_points
-from ciassd_jax.view.view_frame import ViewFrame
+from ciassd_jax.view.view_frame import SCORE_MEANING, ViewFrame
 from ciassd_jax.view.viz_extra import require
 
 # Points of one frame and of one page: what a browser still turns smoothly, in a file that can still be mailed.
@@ -86,7 +86,7 @@ def _describe(frame: ViewFrame, most: int) -> dict[str, Any]:
     """What the page shows of a frame, as plain values; `points` are base64 of int16 x, y, z in units of `STEP`."""
     points, notes = choose_points(frame.points, most)
     kinds = {
-        "truth": _boxes(frame, "ground truth", frame.truth, None, frame.truth_labels),
+        "truth": _boxes(frame, "ground truth", frame.truth, None, frame.truth_labels, frame.is_target),
         "found": _boxes(frame, "detections", frame.boxes, frame.scores, frame.labels),
     }
     left_out = [note for kind in kinds.values() for note in kind.pop("notes")]
@@ -108,9 +108,13 @@ def _boxes(
     boxes: Float[np.ndarray, "D 7"],
     scores: Float[np.ndarray, " D"] | None,
     labels: Sequence[str],
+    is_target: Bool[np.ndarray, " D"] | None = None,
 ) -> dict[str, Any]:
-    """The usable boxes of one kind, with their labels and scores."""
+    """The usable boxes of one kind, with their labels and scores, and the indices of those that are no targets."""
     count = len(boxes)
+    targets = np.ones(count, bool) if is_target is None else is_target
+    if len(targets) != count:
+        raise ValueError(f"{frame.name}: {count} true boxes with {len(targets)} values of `is_target`; give one each.")
     if boxes.shape != (count, 7) or len(labels) not in (0, count) or (scores is not None and len(scores) != count):
         raise ValueError(
             f"{frame.name}: {what} of shape {boxes.shape} with {len(labels)} labels and "
@@ -123,6 +127,7 @@ def _boxes(
         "boxes": np.round(shown, 4).tolist(),
         "labels": [labels[index] for index in chosen] if labels else None,
         "scores": None if scores is None else np.round(scores[chosen].astype(np.float64), 4).tolist(),
+        "dimmed": np.flatnonzero(~targets[chosen]).tolist(),
         "notes": notes,
     }
 
@@ -187,7 +192,7 @@ def _fill(title: str, data: dict[str, Any]) -> str:
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     # File names may contain bytes that are not text.
     shown = title.encode("utf-8", "replace").decode("utf-8")
-    parts = {"title": html.escape(shown), "plotly": _plotly(), "data": text}
+    parts = {"title": html.escape(shown), "plotly": _plotly(), "data": text, "meaning": html.escape(SCORE_MEANING)}
     template = files("ciassd_jax.view").joinpath("page.html").read_text("utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
 

@@ -14,7 +14,9 @@ from ciassd_jax.view.viz_extra import require
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-TRUTH, FOUND = "#d62728", "#13a538"
+# Truth that is no target has a dimmed red.
+TRUTH, DIMMED, FOUND = "#d62728", "#e6a3a1", "#13a538"
+DIMMED_MEANING = "truth that is no target"
 
 
 def new_picture(**options: Any) -> Figure:
@@ -40,7 +42,6 @@ def _picture_class() -> type[Figure]:
 
 
 def captions_of(count: int, scores: np.ndarray | None, labels: Sequence[str] | None) -> list[str]:
-    """Return the caption of each of `count` boxes: its score, and its class if there are several classes."""
-    several = labels is not None and len(set(labels)) > 1
-    parts = [list(labels or []) if several else [], [] if scores is None else [f"{score:.2f}" for score in scores]]
+    """Return the caption of each of `count` boxes: its class and its score, as far as they are given."""
+    parts = [list(labels or []), [] if scores is None else [f"{score:.2f}" for score in scores]]
     return [" ".join(part[i] for part in parts if part) for i in range(count)]

@@ -102,11 +102,12 @@ def read_image(path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
         raise InputError(f"{path} cannot be read as an image; copy it again, or leave out the images.") from error
 
 
-def add_saved(frame: ViewFrame, folder: Path) -> ViewFrame | None:
+def add_saved(frame: ViewFrame, folder: Path, min_score: float = -np.inf) -> ViewFrame | None:
     """Return the frame with its detections saved in `folder` as NAME.json, else as NAME.txt; None without either.
 
-    JSON is as written by `inference.results.write_result`. Rows of text are KITTI's; for a frame without a camera they
-    are x, y, z, length, width, height, yaw, class, score. Raises InputError for a file in another format.
+    Detections of a score below `min_score` are left out. JSON is as written by `inference.results.write_result`. Rows
+    of text are KITTI's; for a frame without a camera they are x, y, z, length, width, height, yaw, class, score. Raises
+    InputError for a file in another format.
     """
     path = _existing(folder, f"{frame.name}.json") or _existing(folder, f"{frame.name}.txt")
     if path is None:
@@ -117,7 +118,9 @@ def add_saved(frame: ViewFrame, folder: Path) -> ViewFrame | None:
         boxes, scores, labels = _read_kitti(path, frame.camera)
     else:
         boxes, scores, labels = _read_custom(path)
-    return frame._replace(boxes=boxes, scores=scores, labels=labels)
+    # Scores that are not finite stay, for the page tells of them.
+    chosen = np.flatnonzero(~(scores < min_score))
+    return frame._replace(boxes=boxes[chosen], scores=scores[chosen], labels=tuple(labels[i] for i in chosen))
 
 
 _Saved = tuple[np.ndarray, np.ndarray, tuple[str, ...]]

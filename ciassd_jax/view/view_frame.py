@@ -7,13 +7,16 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
+from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.formats.kitti_camera import Camera
 from ciassd_jax.types import Scene
 
 NO_BOXES = np.zeros((0, 7))
+# What tables, pictures and pages say of the scores that they show.
+SCORE_MEANING = "score: class probability × predicted IoU⁴, after NMS"  # noqa: RUF001
 
 
 class ViewFrame(NamedTuple):
@@ -21,7 +24,8 @@ class ViewFrame(NamedTuple):
 
     The first columns of `points` are x, y, z (metres); boxes are x, y, z, length, width, height, yaw. `scores` are None
     for boxes without scores, and labels may be empty. `image` is shown only with a `camera` that projects the boxes.
-    `whole` clouds have points that the camera does not see, and that a detector should not get.
+    `whole` clouds have points that the camera does not see, and that a detector should not get. Boxes of the ground
+    truth that are not `is_target` are dimmed; None stands for targets only.
     """
 
     name: str
@@ -34,6 +38,7 @@ class ViewFrame(NamedTuple):
     camera: Camera | None = None
     image: UInt8[np.ndarray, "rows columns 3"] | None = None
     whole: bool = False
+    is_target: Bool[np.ndarray, " G"] | None = None
 
 
 def frame_to_view(frame: Frame, image: UInt8[np.ndarray, "rows columns 3"] | None = None) -> ViewFrame:
@@ -42,10 +47,16 @@ def frame_to_view(frame: Frame, image: UInt8[np.ndarray, "rows columns 3"] | Non
     return ViewFrame(frame.name, frame.points, truth=truth, truth_labels=frame.names, camera=frame.camera, image=image)
 
 
+def mark_targets(frame: ViewFrame, config: Config) -> ViewFrame:
+    """Return the frame with the objects that the config learns as targets: those of its classes and similar ones."""
+    learned = config.labels_by_name(similar=config.data.augmentation.similar_classes)
+    return frame._replace(is_target=np.array([name.lower() in learned for name in frame.truth_labels], bool))
+
+
 def scene_to_view(scene: Scene, class_names: Sequence[str]) -> list[ViewFrame]:
     """Return the view of a training scene, or of each scene of a batch.
 
-    Padding is left out. Obstacles, whose label is negative, are named "other".
+    Padding is left out. Obstacles, whose label is negative, are named "other" and are no targets.
     """
     if np.ndim(scene.frame) == 0:
         scene = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene)
@@ -53,7 +64,8 @@ def scene_to_view(scene: Scene, class_names: Sequence[str]) -> list[ViewFrame]:
     for index, frame in enumerate(np.asarray(scene.frame).tolist()):
         one = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], scene)
         real = slice(int(one.truth.count))
-        labels = tuple(class_names[label] if label >= 0 else "other" for label in one.truth.label[real].tolist())
+        label = one.truth.label[real]
+        names = tuple(class_names[number] if number >= 0 else "other" for number in label.tolist())
         points, truth = one.cloud.points[: int(one.cloud.count)], one.truth.boxes.to_array()[real]
-        frames.append(ViewFrame(f"frame {frame}", points, truth=truth, truth_labels=labels))
+        frames.append(ViewFrame(f"frame {frame}", points, truth=truth, truth_labels=names, is_target=label >= 0))
     return frames

@@ -153,6 +153,28 @@ def test_weights_detect_and_saved_results_show_the_same(view: Any, weights: Path
     assert [frame["found"] for frame in saved.frames] == [frame["found"] for frame in detected.frames]
 
 
+def test_the_least_score_holds_for_detecting_and_for_saved_results(view: Any, weights: Path, tmp_path: Path) -> None:
+    (tmp_path / "clouds").mkdir()
+    write_bin(tmp_path / "clouds" / "a.bin", small_cloud())
+    out = ("--weights", f"{weights}", "--out", f"{tmp_path / 'out'}")
+    assert main(["predict", f"{tmp_path / 'clouds'}", *out]) == 0
+    (everything,) = view(tmp_path / "clouds", "--results", tmp_path / "out").frames
+    scores = everything["found"]["scores"]
+    least = sorted(scores)[len(scores) // 2] - 1e-4
+    for place in (("--weights", weights), ("--results", tmp_path / "out")):
+        (frame,) = view(tmp_path / "clouds", *place, "--min-score", least).frames
+        assert frame["found"]["scores"] == [score for score in scores if score >= least]
+        assert 0 < len(frame["found"]["scores"]) < len(scores)
+
+
+def test_a_config_tells_which_truth_is_no_target(view: Any, weights: Path, tmp_path: Path) -> None:
+    root = write_kitti(tmp_path / "kitti")
+    others = [index for index, name in enumerate(OBJECTS) if name not in ("Car", "Van")]
+    assert others
+    for options, dimmed in (((), []), (("--preset", "car"), others), (("--weights", weights), others)):
+        assert view(root, *SIZE, *options, "--frames", 1).frames[0]["truth"]["dimmed"] == dimmed
+
+
 def test_kitti_rows_are_shown_where_there_is_a_camera(view: Any, tmp_path: Path) -> None:
     root = write_kitti(tmp_path / "kitti")
     calibration = read_calibration(root / "training" / "calib" / f"{NAMES[0]}.txt")
@@ -172,7 +194,7 @@ def test_rows_of_a_custom_data_set(view: Any, tmp_path: Path) -> None:
     for name in "ab":
         (tmp_path / "rows" / f"{name}.txt").write_text("8 1 -1 3.9 1.6 1.5 0.3 Car 0.75\n")
     found = view(root, "--results", tmp_path / "rows").frames[1]["found"]
-    assert found == {"boxes": [[8, 1, -1, 3.9, 1.6, 1.5, 0.3]], "labels": ["Car"], "scores": [0.75]}
+    assert found == {"boxes": [[8, 1, -1, 3.9, 1.6, 1.5, 0.3]], "labels": ["Car"], "scores": [0.75], "dimmed": []}
 
 
 BAD = {
@@ -184,6 +206,9 @@ BAD = {
     "no page": ["{tmp}/kitti", "--out", "picture.png"],
     "page below a file": ["{tmp}/kitti", "--out", "{tmp}/kitti/training/calib/000000.txt/view.html"],
     "both": ["{tmp}/kitti", "--weights", "w.safetensors", "--results", "{tmp}/nothing"],
+    "a threshold without weights": ["{tmp}/kitti", "--score-threshold", "0.5"],
+    "a score without detections": ["{tmp}/kitti", "--min-score", "0.5"],
+    "a score of 1": ["{tmp}/kitti", "--results", "{tmp}/rows", "--min-score", "1"],
     "no weights": ["{tmp}/kitti", "--weights", "{tmp}/absent.safetensors"],
     "no results": ["{tmp}/kitti", "--results", "{tmp}/nothing"],
     "no folder": ["{tmp}/kitti", "--results", "{tmp}/absent"],

@@ -9,8 +9,9 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from ciassd_jax.view.bev import plot_bev
-from ciassd_jax.view.picture import FOUND, TRUTH
+from ciassd_jax.view.bev import plot_bev, plot_frame
+from ciassd_jax.view.picture import DIMMED, FOUND, TRUTH
+from ciassd_jax.view.view_frame import SCORE_MEANING, ViewFrame
 
 POINTS = np.random.default_rng(0).uniform([0, -10, -2, 0], [30, 10, 1, 1], (500, 4)).astype(np.float32)
 BOXES = np.array([[10, 2, -1, 4, 2, 1.5, 0], [20, -3, -1, 4, 2, 1.5, np.pi / 2]], np.float32)
@@ -57,10 +58,33 @@ def test_truth_is_red_and_detections_green_with_scores() -> None:
     assert figure.axes[0].get_title("left") == "A street"
 
 
-def test_classes_are_named_where_there_are_several() -> None:
+def test_captions_name_the_class_of_every_box() -> None:
     scores = np.array([0.9, 0.5], np.float32)
-    assert texts_of(plot_bev(POINTS, BOXES, scores=scores, labels=["Car", "Van"])) == ["Car 0.90", "Van 0.50"]
-    assert texts_of(plot_bev(POINTS, BOXES, scores=scores, labels=["Car", "Car"])) == ["0.90", "0.50"]
+    assert texts_of(plot_bev(POINTS, BOXES, scores=scores, labels=["Car", "Car"])) == ["Car 0.90", "Car 0.50"]
+    assert texts_of(plot_bev(POINTS, BOXES, labels=["Car", "Van"])) == ["Car", "Van"]
+    assert texts_of(plot_bev(POINTS, BOXES[:1], BOXES, labels=["Car"], truth_labels=["Bus", "Van"])) == [
+        "Bus",
+        "Van",
+        "Car",
+    ]
+
+
+def test_truth_that_is_no_target_is_dimmed_and_the_legend_says_so() -> None:
+    frame = ViewFrame("a", POINTS, truth=BOXES, truth_labels=("Car", "Tram"), is_target=np.array([True, False]))
+    figure = plot_frame(frame)
+    for color, (x, y) in ((TRUTH, BOXES[0, :2]), (DIMMED, BOXES[1, :2])):
+        outline, heading = lines_of(figure, color)
+        np.testing.assert_allclose(heading[0], [x, y], atol=1e-6)
+        np.testing.assert_allclose(outline[:4].mean(0), [x, y], atol=1e-6)
+    assert legend_of(figure) == ["sensor", "ground truth (1)", "truth that is no target (1)", "detected (0)"]
+    assert (texts_of(figure), figure.axes[0].get_title("left")) == (["Car", "Tram"], "a")
+
+
+def test_what_a_score_means_is_said_once_where_there_are_scores() -> None:
+    scores = np.array([0.9, 0.5], np.float32)
+    assert plot_bev(POINTS, BOXES, scores=scores).axes[0].get_title("right") == SCORE_MEANING
+    for nothing in (plot_bev(POINTS, BOXES), plot_bev(POINTS, BOXES[:0], scores=scores[:0])):
+        assert nothing.axes[0].get_title("right") == ""
 
 
 def test_axes_are_metres_of_equal_length_and_hold_everything() -> None:

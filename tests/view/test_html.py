@@ -19,7 +19,7 @@ from ciassd_jax.formats.kitti_camera import Camera, lidar_to_image, read_camera
 from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.view.html import FRAME_POINTS, STEP, Page, view_html
 from ciassd_jax.view.outlines import outline_boxes, project_segments
-from ciassd_jax.view.view_frame import ViewFrame
+from ciassd_jax.view.view_frame import SCORE_MEANING, ViewFrame
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform([0, -30, -2, 0], [60, 30, 1, 1], (3000, 4)).astype(np.float32)
@@ -82,7 +82,7 @@ def test_the_page_refers_to_nothing_and_forbids_it() -> None:
 @pytest.mark.parametrize("points", [np.zeros((0, 4), np.float32), POINTS])
 def test_nothing_to_see_is_a_page_too(points: np.ndarray) -> None:
     data = data_of(view_html([ViewFrame("empty", points)]))
-    assert data["frames"][0]["found"] == {"boxes": [], "labels": None, "scores": None}
+    assert data["frames"][0]["found"] == {"boxes": [], "labels": None, "scores": None, "dimmed": []}
     assert np.isfinite(data["bounds"]).all()
 
 
@@ -113,6 +113,21 @@ def test_many_frames_share_the_points_of_a_page() -> None:
     assert [frame["shown"] for frame in data_of(page)["frames"]] == [1000] * 4
 
 
+def test_truth_that_is_no_target_is_marked() -> None:
+    truth = np.concatenate([BOXES, BOXES + 5])
+    truth[0, 3] = np.nan
+    frame = FRAME._replace(truth=truth, truth_labels=("Car", "Tram", "Car", "Cat"), is_target=np.arange(4) % 2 == 0)
+    with pytest.warns(DroppedWarning, match="1 of 4 ground truth"):
+        page = view_html([frame])
+    shown = data_of(page)["frames"][0]
+    assert (shown["truth"]["labels"], shown["truth"]["dimmed"]) == (["Tram", "Car", "Cat"], [0, 2])
+    assert shown["found"]["dimmed"] == data_of(view_html([FRAME]))["frames"][0]["truth"]["dimmed"] == []
+
+
+def test_what_a_score_means_is_said_once() -> None:
+    assert view_html([FRAME]).html.count(html.escape(SCORE_MEANING)) == 1
+
+
 def test_boxes_that_are_not_finite_are_left_out_with_a_note() -> None:
     spoilt = BOXES.copy()
     spoilt[0, 3] = np.nan
@@ -123,7 +138,14 @@ def test_boxes_that_are_not_finite_are_left_out_with_a_note() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"scores": np.ones(3)}, {"labels": ("Car",)}, {"truth_labels": ("Car", "Van")}], ids=str
+    "change",
+    [
+        {"scores": np.ones(3)},
+        {"labels": ("Car",)},
+        {"truth_labels": ("Car", "Van")},
+        {"is_target": np.ones(2, bool)},
+    ],
+    ids=str,
 )
 @pytest.mark.usefixtures("no_type_checks")
 def test_boxes_scores_and_labels_must_belong_together(change: dict) -> None:

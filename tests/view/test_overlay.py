@@ -14,8 +14,9 @@ from ciassd_jax.formats.kitti_camera import Calibration, lidar_to_image, read_ca
 from ciassd_jax.formats.kitti_rows import read_rows
 from ciassd_jax.view.outlines import outline_boxes, project_segments
 from ciassd_jax.view.overlay import plot_overlay
-from ciassd_jax.view.picture import FOUND, TRUTH
+from ciassd_jax.view.picture import DIMMED, FOUND, TRUTH
 from ciassd_jax.view.sources import read_image
+from ciassd_jax.view.view_frame import SCORE_MEANING
 
 WIDTH, HEIGHT = IMAGE_SIZE
 IMAGE = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
@@ -43,8 +44,19 @@ def test_boxes_lie_where_the_camera_sees_them(calibration: Calibration) -> None:
     expected = project_segments(outline_boxes(BOXES), lidar_to_image(calibration))
     np.testing.assert_allclose(boxes_of(figure, TRUTH), expected)
     np.testing.assert_allclose(boxes_of(figure, FOUND), expected[:1])
-    assert texts_of(figure) == ["0.88"]
+    assert texts_of(figure) == ["0.88", SCORE_MEANING]
     assert figure.axes[0].get_title("left") == "A street"
+
+
+def test_boxes_are_named_and_truth_that_is_no_target_is_dimmed(calibration: Calibration) -> None:
+    names, targets = ["Car", "Tram"], np.array([True, False])
+    figure = plot_overlay(IMAGE, calibration, BOXES[:1], BOXES, labels=["Car"], truth_labels=names, is_target=targets)
+    expected = project_segments(outline_boxes(BOXES), lidar_to_image(calibration))
+    np.testing.assert_allclose(boxes_of(figure, TRUTH), expected[:1])
+    np.testing.assert_allclose(boxes_of(figure, DIMMED), expected[1:])
+    assert texts_of(figure) == ["Car", "Tram", "Car", "pale red: truth that is no target"]
+    below, _, above, _ = (text.get_position()[1] for text in figure.axes[0].texts)
+    assert above < expected[0, ..., 1].min() < expected[0, ..., 1].max() < below
 
 
 def test_the_picture_is_the_image(calibration: Calibration, tmp_path: Path) -> None:
@@ -66,7 +78,7 @@ def test_a_box_around_the_camera_is_cut_and_stays_in_the_picture(calibration: Ca
 def test_boxes_out_of_sight_are_left_out(box: list[float], calibration: Calibration) -> None:
     figure = plot_overlay(IMAGE, calibration, np.array([box]), scores=np.array([0.5]))
     assert not boxes_of(figure, FOUND)
-    assert not texts_of(figure)
+    assert texts_of(figure) == [SCORE_MEANING]
 
 
 @pytest.mark.reference

@@ -1,13 +1,17 @@
 """Frames and scenes as the records that a page shows."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 from small import random_scene, small_cloud, small_config
 
+from ciassd_jax.config.presets import car
+from ciassd_jax.config.training import AugmentationConfig, DataConfig
 from ciassd_jax.data.frames import Frame
 from ciassd_jax.inference.results import FrameResult
 from ciassd_jax.types import Boxes
-from ciassd_jax.view.view_frame import frame_to_view, scene_to_view
+from ciassd_jax.view.view_frame import frame_to_view, mark_targets, scene_to_view
 
 BOXES = np.array([[8, 1, -1, 3.9, 1.6, 1.5, 0.3], [10, -3, -1, 4.6, 1.9, 2.0, -1.2]])
 
@@ -24,6 +28,17 @@ def test_a_labelled_frame_shows_its_objects_as_the_truth() -> None:
     )
     np.testing.assert_array_equal(seen.truth, BOXES)
     np.testing.assert_array_equal(seen.points, frame.points)
+
+
+def test_targets_are_what_the_config_learns_in_any_case() -> None:
+    names = ("car", "VAN", "Pedestrian", "Truck")
+    boxes = Boxes.from_array(BOXES.repeat(2, 0))
+    frame = frame_to_view(Frame("a", small_cloud(), boxes, names, np.zeros(4, np.int64), None))
+    assert frame.is_target is None
+    assert mark_targets(frame, car()).is_target.tolist() == [True, True, False, False]
+    strict = replace(car(), data=DataConfig(augmentation=AugmentationConfig(similar_classes=False)))
+    assert mark_targets(frame, strict).is_target.tolist() == [True, False, False, False]
+    assert mark_targets(frame._replace(truth=BOXES[:0], truth_labels=()), car()).is_target.tolist() == []
 
 
 def test_a_scene_is_shown_without_its_padding() -> None:
@@ -45,6 +60,7 @@ def test_a_batch_shows_each_of_its_scenes() -> None:
     np.testing.assert_array_equal(first.truth, scene_to_view(scenes[0], ["Car"])[0].truth)
     np.testing.assert_array_equal(second.points, scene_to_view(scenes[1], ["Car"])[0].points)
     assert (first.truth_labels[0], second.truth_labels[0]) == ("Car", "other")
+    assert (first.is_target.tolist(), second.is_target.tolist()) == ([True, True], [False, True])
 
 
 def test_a_result_joins_its_frame() -> None:
