@@ -42,6 +42,7 @@ MinScore = Annotated[
         help_behavior_hint="",
     ),
 ]
+BatchSize = Annotated[int, tyro.conf.arg(metavar="CLOUDS", help="Number of clouds that are detected at once.")]
 Columns = Annotated[
     str | None,
     tyro.conf.arg(
@@ -75,11 +76,23 @@ class Frames:
             raise UsageError(f"--frames is the number of simulated frames; give it with --data {SIMULATED}.")
         return find_root(self.data)
 
+    def arguments(self) -> list[str]:
+        """Return the options that select these frames again."""
+        given = {"--data": self.data, "--frames": self.frames, "--columns": self.columns}
+        options = [text for name, value in given.items() if value is not None for text in (name, str(value))]
+        return options if self.image_size is None else [*options, "--image-size", *map(str, self.image_size)]
+
     def open(self, split: str, seed: int) -> Dataset:
         """Open the frames of a split; `seed` is that of simulated frames."""
         if self.data == SIMULATED:
             return open_simulated(split, SIMULATED_FRAMES if self.frames is None else self.frames, seed)
         return open_dataset(self.find_folder(), split, self.image_size, read_columns(self.columns))
+
+
+def check_batch_size(batch_size: int) -> None:
+    """Raise UsageError for a value of --batch-size that is below 1."""
+    if batch_size < 1:
+        raise UsageError(f"--batch-size is {batch_size}; detect at least 1 cloud at once.")
 
 
 def read_columns(text: str | None) -> int | tuple[str, ...] | None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
+from shlex import join
 from typing import Annotated, Literal
 
 import jax
@@ -135,13 +136,20 @@ class Train:
             progress=True,
             log=log,
         )
-        step = int(fitted.state.step)
+        plot = f"`{join(['ciassd', 'plot', str(self.workdir)])}`"
         if fitted.stopped is not None:
-            log(f"Stopped by signal {fitted.stopped} after step {step}, which is saved; re-run the command to resume.")
+            curves = f"; {plot} draws the curves so far" if int(fitted.state.step) else ""
+            log(f"Run the same command again to resume{curves}.")
             return 128 + fitted.stopped
-        best = "" if fitted.best is None else f"; best AP {fitted.best:.2f}"
-        log(f"Trained {step} steps{best}. Weights, metrics and evaluations are in {self.workdir}.")
-        return 0 if self.overfit_one is None else self._report_overfit(fitted.state, dataset, config, log)
+        code = 0 if self.overfit_one is None else self._report_overfit(fitted.state, dataset, config, log)
+        log(f"Next: {plot}" if validation is None else f"Next: `{self._evaluation()}`, {plot}")
+        return code
+
+    def _evaluation(self) -> str:
+        """The command that evaluates the best weights on the validation frames."""
+        split = [] if self.validate == "val" else ["--split", self.validate]
+        seed = ["--seed", str(self.seed)] if self.seed else []
+        return join(["ciassd", "eval", "--workdir", str(self.workdir), *self.data_set.arguments(), *split, *seed])
 
     def _config(self, frames: int) -> Config:
         """The chosen config with the fields that are given as options."""
