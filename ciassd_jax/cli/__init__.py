@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from ciassd_jax.cli.bench import Bench
 from ciassd_jax.cli.config_options import Replaced, print_fields, take_fields
 from ciassd_jax.cli.convert import Convert
 from ciassd_jax.cli.data_check import Check
@@ -23,7 +24,9 @@ from ciassd_jax.cli.data_prepare import Prepare
 from ciassd_jax.cli.data_suggest import Suggest
 from ciassd_jax.cli.data_synth import Synth
 from ciassd_jax.cli.demo import Demo
+from ciassd_jax.cli.doctor import Doctor
 from ciassd_jax.cli.eval import Evaluate
+from ciassd_jax.cli.export import Export
 from ciassd_jax.cli.info import Info
 from ciassd_jax.cli.messages import UsageError, describe, option_of, silenced
 from ciassd_jax.cli.names import check_names
@@ -62,6 +65,9 @@ Command = (
     | Annotated[Submit, tyro.conf.subcommand("submit")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 
 

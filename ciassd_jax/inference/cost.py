@@ -48,14 +48,13 @@ def _positions(part: str, layer: str, config: Config, cells: int) -> int:
 
 
 def compiled_memory(config: Config, num_points: int) -> dict[str, Any]:
-    """Return the platform and the memory, in bytes, of `predict` compiled for clouds of up to `num_points` points.
+    """Return the platform, and the `program_memory` of `predict` for clouds of up to `num_points` points."""
+    program = compile_predict(config.for_inference(), bucket_of(num_points))
+    return {"platform": jax.default_backend(), **program_memory(program)}
 
-    A number is None if the backend does not report it.
-    """
-    memory: Any = compile_predict(config.for_inference(), bucket_of(num_points)).memory_analysis()
-    return {
-        "platform": jax.default_backend(),
-        "arguments": getattr(memory, "argument_size_in_bytes", None),
-        "outputs": getattr(memory, "output_size_in_bytes", None),
-        "temporaries": getattr(memory, "temp_size_in_bytes", None),
-    }
+
+def program_memory(program: jax.stages.Compiled) -> dict[str, int | None]:
+    """Return the bytes of arguments, outputs and temporaries of a program; None if the backend does not report them."""
+    memory: Any = program.memory_analysis()
+    names = {"arguments": "argument", "outputs": "output", "temporaries": "temp"}
+    return {name: getattr(memory, f"{field}_size_in_bytes", None) for name, field in names.items()}
