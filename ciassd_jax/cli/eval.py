@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from json import dumps
 from pathlib import Path
 from typing import Annotated
 
@@ -12,11 +13,14 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
-from ciassd_jax.cli.options import Dtype, Frames, MinScore, ScoreThreshold, Unset
+from ciassd_jax.cli.options import BatchSize, Dtype, Frames, MinScore, ScoreThreshold, Unset, check_batch_size
+from ciassd_jax.config import Config
+from ciassd_jax.data.frames import Dataset
 from ciassd_jax.evaluation import LIMITS, Evaluation, Limits, evaluate, format_json, format_report, read_folders
 from ciassd_jax.formats.writing import check_folder, write_text
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.scoring import Scored, detect_dataset, find_trained, score_frames, write_frames
+from ciassd_jax.training.validation import format_scores, score_checkpoints
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,9 @@ class Evaluate:
     """Weights file (.safetensors, or a released .pth), or the name of bundled weights."""
     workdir: Unset[Path] = None
     """Or the folder of a training, whose best weights are evaluated."""
+    every: Annotated[bool, tyro.conf.arg(name="all")] = False
+    """Evaluate every checkpoint in --workdir, and print one table of AP by step; --json writes it too."""
+    batch_size: BatchSize = 1
     split: str = "val"
     """The frames to evaluate: train, val, trainval, all or a file of ImageSets."""
     seed: int = 0
@@ -113,6 +120,7 @@ class Evaluate:
         return self.files.run()
 
     def _network(self) -> int:
+        check_batch_size(self.batch_size)
         short = {
             "dtype": self.dtype,
             "detection.score_threshold": self.score_threshold,
@@ -125,16 +133,31 @@ class Evaluate:
                 check_folder(out)
         with warnings_as_lines(folder or "simulated frames"):
             dataset = self.data_set.open(self.split, self.seed)
-            frames = detect_dataset(Detector(weights.variables, weights.config), dataset, frames_with_bar)
+            if self.every:
+                return self._checkpoints(dataset, weights.config)
+            detector = Detector(weights.variables, weights.config)
+            frames = detect_dataset(detector, dataset, frames_with_bar, batch_size=self.batch_size)
         evaluation = score_frames(frames, weights.config)
         print(format_report(evaluation))
         boxes, seconds = sum(len(frame.lines) for frame in frames), sum(frame.result.seconds for frame in frames)
-        milliseconds = f"{1e3 * seconds / len(frames):.0f} ms per frame"
-        print(f"\n{len(frames)} frames, {boxes} boxes, {milliseconds} without reading and compilation.")
+        milliseconds = f"{1e3 * seconds / len(frames):.0f} ms per frame without reading and compilation"
+        batches = f", in batches of {self.batch_size}" if self.batch_size > 1 else ""
+        print(f"\n{len(frames)} frames, {boxes} boxes, {milliseconds}{batches}.")
         self._write(frames, evaluation)
         return 0
 
+    def _checkpoints(self, dataset: Dataset, config: Config) -> int:
+        assert self.workdir is not None
+        scores = score_checkpoints(self.workdir, dataset, config, frames_with_bar, batch_size=self.batch_size)
+        print(format_scores(scores))
+        if self.json is not None:
+            write_text(self.json, dumps(scores, indent=1))
+            print(f"Wrote {self.json}.")
+        return 0
+
     def _weights(self) -> Path:
+        if self.every and (self.workdir is None or self.out is not None):
+            raise UsageError("--all prints one table for the checkpoints of --workdir; give that, without --out.")
         if self.weights is not None and self.workdir is None:
             return self.weights
         if self.workdir is not None and self.weights is None:

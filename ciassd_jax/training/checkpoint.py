@@ -18,13 +18,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from ciassd_jax.config import Config
 from ciassd_jax.data.loader import LoaderState
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike
 from ciassd_jax.formats.writing import check_folder
+from ciassd_jax.model.network import variable_shapes
 from ciassd_jax.training.distributed import on_process_0
-from ciassd_jax.types import TrainState
+from ciassd_jax.types import TrainState, Variables
 
 # Version of a checkpoint's content; 2 since the optimizer works on one vector of all parameters.
 FORMAT = 2
@@ -174,6 +176,40 @@ class Checkpoints:
             f"A checkpoint cannot be written to {self.folder} ({_reason(error)}); free some space or check its "
             "permissions, then run again: the earlier checkpoints are intact."
         )
+
+
+def checkpoint_steps(folder: Pathlike) -> list[int]:
+    """Return the steps of the complete checkpoints in a folder, in ascending order; raise InputError if none is."""
+    steps = sorted(int(path.name) for path in Path(folder).glob("*") if path.name.isdecimal() and path.is_dir())
+    if not steps:
+        raise InputError(f"{folder} has no checkpoint; give the folder of a training that has saved one.")
+    return steps
+
+
+def checkpoint_variables(folder: Pathlike, step: int) -> Variables:
+    """Read the weights that evaluation uses, {"params", "batch_stats"}, from the checkpoint of a step.
+
+    Changes nothing, so the training may be running. Raises InputError for a checkpoint that cannot be read.
+    """
+    import orbax.checkpoint as ocp
+
+    place = Path(folder).absolute() / str(step)
+    try:
+        progress = json.loads((place / "progress" / "metadata").read_text(encoding="utf-8"))
+        config = Config.from_json(json.dumps(progress["config"]))
+        params, shapes = "ema" if config.schedule.ema_decay else "params", variable_shapes(config)
+        wanted = {params: shapes["params"], "batch_stats": shapes["batch_stats"]}
+        as_arrays = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
+        _check_arrays(place / "state")
+        with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as reader:
+            arguments = ocp.args.PyTreeRestore(wanted, restore_args=as_arrays, partial_restore=True)
+            found = reader.restore(place / "state", args=arguments)
+    # Orbax and its storage raise errors of many types for damaged files.
+    except Exception as error:
+        raise InputError(
+            f"{place} cannot be read ({_reason(error)}); remove this folder to evaluate the others."
+        ) from error
+    return {"params": found[params], "batch_stats": found["batch_stats"]}
 
 
 def _reason(error: Exception) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,9 @@ from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.kitti_rows import DIFFICULTIES
 from ciassd_jax.formats.writing import write_text
 from ciassd_jax.inference.detector import Detector
-from ciassd_jax.inference.scoring import detect_dataset, score_frames, write_frames
+from ciassd_jax.inference.scoring import detect_dataset, score_dataset, score_frames, write_frames
 from ciassd_jax.ops.iou import iou_3d
+from ciassd_jax.training.checkpoint import checkpoint_steps, checkpoint_variables
 from ciassd_jax.types import Boxes, Variables
 
 
@@ -36,6 +37,43 @@ def score_weights(
     write_text(folder / "result.json", format_json(evaluation))
     write_text(folder / "table.txt", format_report(evaluation))
     return precisions(evaluation, config) | {"detections": sum(len(frame.result) for frame in frames)}
+
+
+def score_checkpoints(
+    workdir: Pathlike,
+    dataset: Dataset,
+    config: Config,
+    track: Callable[[Sequence[str]], Iterable[str]] = iter,
+    *,
+    batch_size: int = 1,
+) -> dict[int, dict[str, float]]:
+    """Return `precisions` of every checkpoint in the folder of a training, by step.
+
+    `track` wraps the iteration over the frames of each, for a progress bar. Raises InputError if there is no
+    checkpoint, and for one that cannot be read.
+    """
+    folder = Path(workdir) / "checkpoints"
+    # All at once, because a running training removes checkpoints.
+    weights = {step: checkpoint_variables(folder, step) for step in checkpoint_steps(folder)}
+    return {
+        step: precisions(score_dataset(Detector(variables, config), dataset, track, batch_size=batch_size), config)
+        for step, variables in weights.items()
+    }
+
+
+def format_scores(scores: Mapping[int, Mapping[str, float]]) -> str:
+    """Return a table of `score_checkpoints`: one row per step, with AP of each class at its strict limit."""
+    strict = _strict_names(next(iter(scores.values())))
+    titles = {"score": "score"} | {
+        name: f"{kind} {metric.upper()} {name.split('_')[-3]}" for (kind, metric), name in strict.items()
+    }
+    best = max(scores, key=lambda step: scores[step]["score"])
+    lines = [f"{'step':>8}" + "".join(f"{title:>{len(title) + 3}}" for title in titles.values())]
+    for step, numbers in scores.items():
+        row = "".join(f"{numbers[name]:>{len(title) + 3}.2f}" for name, title in titles.items())
+        lines.append(f"{step:>8}{row}{'   best' if step == best else ''}")
+    level, recall = next(iter(strict.values())).split("_")[-2:]
+    return "\n".join([f"AP in percent, {level}, {recall}; the score is the mean in 3D", *lines])
 
 
 def precisions(evaluation: Evaluation, config: Config) -> dict[str, float]:
@@ -60,14 +98,21 @@ def precisions(evaluation: Evaluation, config: Config) -> dict[str, float]:
 
 
 def describe_score(numbers: Mapping[str, float]) -> str:
-    """Return the score of `score_weights` and that of each class in a few words."""
-    strict: dict[str, float] = {}
-    for name, value in numbers.items():
-        if "_3d_" in name:
-            # The strict limit of a class comes first.
-            strict.setdefault(name.rpartition("_3d_")[0], value)
-    classes = ", ".join(f"{name} {value:.2f}" for name, value in strict.items())
+    """Return the score of `score_weights`, its part of each class, and the number of detections, in a few words."""
+    strict = _strict_names(numbers)
+    classes = ", ".join(f"{kind} {numbers[name]:.2f}" for (kind, metric), name in strict.items() if metric == "3d")
     return f"AP {numbers['score']:.2f} ({classes}), {numbers['detections']:.0f} detections"
+
+
+def _strict_names(numbers: Mapping[str, float]) -> dict[tuple[str, str], str]:
+    """Return the names of `precisions` at the strict limit, by class and metric."""
+    names: dict[tuple[str, str], str] = {}
+    for name in numbers:
+        kind, *parts = name.rsplit("_", 4)
+        if len(parts) == 4:
+            # The strict limit of a class comes first.
+            names.setdefault((kind, parts[0]), name)
+    return names
 
 
 def precision_of(
