@@ -13,7 +13,19 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
-from ciassd_jax.cli.options import BatchSize, Dtype, Frames, MinScore, ScoreThreshold, Unset, check_batch_size
+from ciassd_jax.cli.options import (
+    BatchSize,
+    Dtype,
+    File,
+    Folder,
+    Frames,
+    MinScore,
+    ScoreThreshold,
+    Split,
+    Unset,
+    WeightsFile,
+    check_batch_size,
+)
 from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.evaluation import LIMITS, Evaluation, Limits, evaluate, format_json, format_report, read_folders
@@ -37,7 +49,7 @@ class Text:
         tyro.conf.arg(metavar="CLASS=OVERLAP ...", help_behavior_hint=""),
     ] = ()
     """Also evaluate other classes, such as Vehicle=0.5 Forklift=0.4, or KITTI's at another overlap."""
-    json: Unset[Path] = None
+    json: File[Unset[Path]] = None
     """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
 
     def run(self) -> int:
@@ -87,20 +99,20 @@ class Evaluate:
     """
 
     data_set: Annotated[Frames, tyro.conf.OmitArgPrefixes] = field(default_factory=Frames)
-    weights: Unset[Path] = None
+    weights: WeightsFile[Unset[Path]] = None
     """Weights file (.safetensors, or a released .pth), or the name of bundled weights."""
-    workdir: Unset[Path] = None
+    workdir: Folder[Unset[Path]] = None
     """Or the folder of a training, whose best weights are evaluated."""
     every: Annotated[bool, tyro.conf.arg(name="all")] = False
     """Evaluate every checkpoint in --workdir, and print one table of AP by step; --json writes it too."""
     batch_size: BatchSize = 1
-    split: str = "val"
+    split: Split[str] = "val"
     """The frames to evaluate: train, val, trainval, all or a file of ImageSets."""
     seed: int = 0
     """Seed of simulated frames."""
-    out: Unset[Path] = None
+    out: Folder[Unset[Path]] = None
     """Folder for the detections of every frame (NAME.txt), result.json and table.log."""
-    json: Unset[Path] = None
+    json: File[Unset[Path]] = None
     """Also write AP to this file: class, metric, R11 or R40, overlap, [easy, moderate, hard]."""
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     dtype: Unset[Dtype] = None

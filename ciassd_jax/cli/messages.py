@@ -98,8 +98,9 @@ def warnings_as_lines(source: Path | str) -> Iterator[None]:
         if not issubclass(category, DroppedWarning | FormatWarning):
             before(message, category, *rest, **more)
             return
-        text = describe(message if issubclass(category, FormatWarning) else f"{source}: {message}")
-        alike = kinds.setdefault(getattr(message, "kind", text), [])
+        names_input = issubclass(category, FormatWarning) or message.source
+        text = describe(message if names_input else f"{source}: {message}")
+        alike = kinds.setdefault(message.kind, [])
         alike.append(text)
         if len(alike) == 1:
             tqdm.write(f"warning: {text}", file=sys.stderr)

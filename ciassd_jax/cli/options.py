@@ -17,6 +17,13 @@ from ciassd_jax.simulation import open_synthetic, split_synthetic
 T = TypeVar("T")
 # An option without a default; the help does not print "default: None".
 Unset = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]
+# The word in the help for a value.
+File = Annotated[T, tyro.conf.arg(metavar="FILE")]
+Folder = Annotated[T, tyro.conf.arg(metavar="FOLDER")]
+WeightsFile = Annotated[T, tyro.conf.arg(metavar="FILE|NAME")]
+Split = Annotated[T, tyro.conf.arg(metavar="SPLIT")]
+Steps = Annotated[T, tyro.conf.arg(metavar="STEPS")]
+Epochs = Annotated[T, tyro.conf.arg(metavar="EPOCHS")]
 ImageSize = Annotated[
     tuple[int, int] | None,
     tyro.conf.arg(

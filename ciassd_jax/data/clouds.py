@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
+from ciassd_jax.data.folders import frame_files, is_custom, is_kitti, open_dataset
 from ciassd_jax.data.frames import clean_points
 from ciassd_jax.data.kitti import crop_to_view, is_reduced
-from ciassd_jax.data.splits import same_stem, with_suffixes
+from ciassd_jax.data.splits import ALL, find_file, same_stem, with_suffixes
 from ciassd_jax.formats.errors import InputError, Pathlike, collected_warnings, read_bytes
 from ciassd_jax.formats.kitti_camera import IMAGE_SUFFIXES, Camera, read_camera
 from ciassd_jax.formats.points import POINT_SUFFIXES, read_points
@@ -27,22 +28,33 @@ class CloudFile(NamedTuple):
 def find_clouds(
     path: Pathlike,
     *,
+    split: str = ALL,
     calib: Pathlike | None = None,
     image_size: tuple[int, int] | None = None,
     columns: int | Sequence[str] | None = None,
+    problems: list[InputError] | None = None,
 ) -> list[CloudFile]:
-    """Return the cloud at `path`, or the clouds in that folder in the order of their names, each with its camera.
+    """Return the cloud at `path`, the clouds in that folder in the order of their names, or those of a data set.
 
-    `calib` is a calibration file for all clouds or a folder with one per cloud; it defaults to `X/calib/NAME.txt` for
+    `split` selects the frames of a data set (`open_dataset`). Each cloud comes with its camera: `calib` is a
+    calibration file for all clouds or a folder with one per cloud; it defaults to `X/calib/NAME.txt` for
     `X/velodyne*/NAME.bin` if that exists. The size of the image is `image_size`, else that of `X/image_2/NAME.png` or
     `.jpg`, else KITTI's for the focal length. `columns` are those of the clouds (`read_points`). Names that start with
-    a dot are no clouds. Raises InputError for a cloud or a calibration that cannot be used; of several clouds only
-    names and sizes are checked.
+    a dot are no clouds.
+
+    Raises InputError for a cloud or a calibration that cannot be used; of several clouds only names and sizes are
+    checked. With a list of `problems`, these errors are appended to it instead, and the other clouds are returned.
     """
-    clouds = _find_clouds(Path(path))
+    clouds, found = _find_clouds(Path(path), split, image_size, columns), []
     for cloud in clouds:
-        _check_cloud(cloud, columns, whole=len(clouds) == 1)
-    return [CloudFile(cloud, _find_camera(cloud, calib, image_size)) for cloud in clouds]
+        try:
+            _check_cloud(cloud, columns, whole=len(clouds) == 1)
+            found.append(CloudFile(cloud, _find_camera(cloud, calib, image_size)))
+        except InputError as error:
+            if problems is None:
+                raise
+            problems.append(error)
+    return found
 
 
 def read_cloud(file: CloudFile, columns: int | Sequence[str] | None = None) -> tuple[Float32[np.ndarray, "P 4"], int]:
@@ -68,9 +80,15 @@ def find_beside(cloud: Path, folder: str, *suffixes: str) -> Path | None:
     return next((path for suffix in suffixes if (path := stem.with_name(stem.name + suffix)).is_file()), None)
 
 
-def _find_clouds(path: Path) -> list[Path]:
+def _find_clouds(
+    path: Path, split: str, image_size: tuple[int, int] | None, columns: int | Sequence[str] | None
+) -> list[Path]:
     if not path.is_dir():
         return [path]
+    if is_kitti(path) or is_custom(path):
+        names = open_dataset(path, split, image_size, columns, need_labels=False).names
+        folder, places = frame_files(path, split)
+        return [cloud for name in names if (cloud := find_file(folder, places["cloud"], name))]
     clouds = sorted(p for p in path.iterdir() if p.suffix.lower() in POINT_SUFFIXES and not p.name.startswith("."))
     if not clouds:
         raise InputError(f"{path} holds no point cloud; give a folder of {', '.join(POINT_SUFFIXES)} files.")

@@ -16,18 +16,23 @@ class InputError(ValueError):
     """An input cannot be used; the message is one sentence that names it and the remedy."""
 
 
-class FormatWarning(UserWarning):
-    """A file lacks something; the message names it and the substitute.
+class _InputWarning(UserWarning):
+    """A warning of an input, which may be named as its `source`.
 
-    Warnings of the same `kind` have the same message but for numbers and `source`, the file that the message names.
+    Warnings of the same `kind` have the same message but for numbers and `source`, which the message names.
     """
 
     def __init__(self, message: str, source: Pathlike = "") -> None:
         super().__init__(message)
-        self.kind = re.sub(r"\d[\d.e+]*", "", message.replace(str(source), ""))
+        self.source = str(source)
+        self.kind = re.sub(r"\d[\d.e+]*", "", message.replace(self.source, ""))
 
 
-class DroppedWarning(UserWarning):
+class FormatWarning(_InputWarning):
+    """A file lacks something; the message names it and the substitute."""
+
+
+class DroppedWarning(_InputWarning):
     """Part of the input was dropped; the message tells how much and why."""
 
 

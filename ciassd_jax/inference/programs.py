@@ -20,11 +20,17 @@ def keep_programs() -> None:
     """Keep compiled programs in ~/.cache/ciassd_jax, so that later processes skip the compilation.
 
     JAX_COMPILATION_CACHE_DIR, or `jax.config`, sets another folder; JAX_ENABLE_COMPILATION_CACHE=false disables the
-    cache.
+    cache. Without a folder that can be written, every process compiles anew.
     """
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(cache / "ciassd_jax"))
+    if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
+        return
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "ciassd_jax")
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(cache, os.W_OK | os.X_OK):
+        jax.config.update("jax_compilation_cache_dir", str(cache))
 
 
 def compile_program(function: Any, *arguments: Any, what: str, signals: Sequence[int] = (), **named: Any) -> Any:

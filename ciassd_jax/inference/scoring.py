@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ciassd_jax.config import Config
+from ciassd_jax.data.ahead import read_ahead
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.evaluation.kitti_ap import LIMITS, limits_of
 from ciassd_jax.evaluation.objects import DetectedObjects, LabelledObjects, detections_from_rows, labels_from_frame
@@ -49,10 +51,14 @@ class Scored(NamedTuple):
 
 
 def score_dataset(
-    detector: Detector, dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
+    detector: Detector,
+    dataset: Dataset,
+    track: Callable[[Sequence[str]], Iterable[str]] = iter,
+    *,
+    batch_size: int = 1,
 ) -> Evaluation:
     """Return the average precision of a detector on a data set: `score_frames` of `detect_dataset`."""
-    return score_frames(detect_dataset(detector, dataset, track), detector.config)
+    return score_frames(detect_dataset(detector, dataset, track, batch_size=batch_size), detector.config)
 
 
 def score_frames(frames: Sequence[Scored], config: Config) -> Evaluation:
@@ -73,34 +79,49 @@ def score_frames(frames: Sequence[Scored], config: Config) -> Evaluation:
 
 
 def detect_dataset(
-    detector: Detector, dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
+    detector: Detector,
+    dataset: Dataset,
+    track: Callable[[Sequence[str]], Iterable[str]] = iter,
+    *,
+    batch_size: int = 1,
 ) -> list[Scored]:
     """Detect objects in every frame of a data set; in a frame with a camera only those in its view.
 
-    `track` wraps the iteration over the names, for a progress bar. Gives one FormatWarning for each kind of problem
-    with the frames, and one DroppedWarning with everything that was dropped, summed over the frames. Raises InputError
-    for a frame that cannot be read or has no labels.
+    `batch_size` frames are detected at once, while a thread reads the next ones. `track` wraps the iteration over the
+    names, for a progress bar. Gives one FormatWarning for each kind of problem with the frames, and one DroppedWarning
+    with everything that was dropped, summed over the frames. Raises InputError for a frame that cannot be read or has
+    no labels.
     """
     scored: list[Scored] = []
-    for frame, truth in labelled_frames(dataset, track):
+    frames = labelled_frames(dataset, track, ahead=batch_size)
+    while batch := list(islice(frames, batch_size)):
         with warnings.catch_warnings():
             # `describe_dropped` sums the same counts over all frames.
-            warnings.filterwarnings("ignore", "Dropped ", DroppedWarning)
-            result = detector(frame.points, frustum=frustum_of(frame.camera), source=f"Frame {frame.name}")
-        scored.append(score_frame(frame, truth, result))
+            warnings.filterwarnings("ignore", ".*: dropped ", DroppedWarning)
+            results = detector(
+                [frame.points for frame, _ in batch],
+                frustum=[frustum_of(frame.camera) for frame, _ in batch],
+                source=[f"Frame {frame.name}" for frame, _ in batch],
+                batch_size=batch_size,
+            )
+        scored += [score_frame(*labelled, result) for labelled, result in zip(batch, results, strict=True)]
     if dropped := describe_dropped(scored):
         warnings.warn(dropped, DroppedWarning, stacklevel=2)
     return scored
 
 
 def labelled_frames(
-    dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter
+    dataset: Dataset, track: Callable[[Sequence[str]], Iterable[str]] = iter, *, ahead: int = 1
 ) -> Iterator[tuple[Frame, LabelledObjects]]:
-    """Yield each frame of a data set and its labels; warnings and errors are those of `detect_dataset`."""
+    """Yield each frame of a data set and its labels, while a thread reads the next ones.
+
+    Warnings and errors are those of `detect_dataset`.
+    """
     found: list[FormatWarning] = []
-    for index, _ in enumerate(track(dataset.names)):
+    reading = read_ahead(dataset.read, range(len(dataset)), ahead)
+    for _, take in zip(track(dataset.names), reading, strict=True):
         with collected_warnings() as caught:
-            frame = dataset.read(index)
+            frame = take()
         truth = labels_from_frame(frame)
         found += caught
         yield frame, truth

@@ -115,7 +115,7 @@ def predict_features(state_or_variables: Variables, cloud: PointCloud, config: C
     Pure; under `jax.jit` the config is static. Arguments are those of `predict`. Cell (h, w) is centred at
     x = minimum + (w + 1/2) * cell, y likewise with h, where a cell has `config.backbone.stride` voxels.
     """
-    variables = _fitting_variables(state_or_variables, config)
+    variables = fitting_variables(state_or_variables, config)
     features: Any = CIASSD(config).apply(variables, voxelize_batch(cloud, config), method="features")
     return features
 
@@ -129,13 +129,13 @@ def predict_raw(state_or_variables: Variables, cloud: PointCloud, config: Config
 
 def predict_voxels(state_or_variables: Variables, voxels: SparseVoxels, config: Config) -> RawPredictions:
     """Run the network in evaluation mode on a batch of voxelised scenes."""
-    output: Any = CIASSD(config).apply(_fitting_variables(state_or_variables, config), voxels)
+    output: Any = CIASSD(config).apply(fitting_variables(state_or_variables, config), voxels)
     predictions, kept, dropped = output
     return RawPredictions(predictions, voxels, kept, dropped)
 
 
-def _fitting_variables(state_or_variables: Variables, config: Config) -> dict[str, Any]:
-    """`variables_of` a state or variables; raises ValueError if they do not fit the config."""
+def fitting_variables(state_or_variables: Variables, config: Config) -> dict[str, Any]:
+    """Return {"params", "batch_stats"} of a train state or mapping; raises ValueError unless they fit the config."""
     variables = variables_of(state_or_variables)
     check_variables(variables, variable_shapes(replace(config.for_inference(), program="auto")))
     return variables

@@ -1,6 +1,8 @@
 """`Detector`: inputs, results, compilation and warnings."""
 
 import re
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,7 +31,7 @@ def detector() -> Detector:
 def quiet() -> Iterator[None]:
     """Ignore the warning that the small network drops candidates."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Dropped .* candidates", DroppedWarning)
+        warnings.filterwarnings("ignore", ".*: dropped .* candidates", DroppedWarning)
         yield
 
 
@@ -53,14 +55,119 @@ def test_one_cloud_gives_one_result(detector: Detector) -> None:
 
 
 @pytest.mark.usefixtures("quiet")
-def test_a_list_gives_a_list_and_neighbours_do_not_matter(detector: Detector) -> None:
-    clouds = [small_cloud(0), small_cloud(1, 50)]
-    together, alone = detector(clouds), [detector(cloud) for cloud in clouds]
-    assert isinstance(together, list)
-    for one, other in zip(together, alone, strict=True):
-        np.testing.assert_array_equal(one.boxes, other.boxes)
-        np.testing.assert_array_equal(one.scores, other.scores)
-    assert detector([]) == []
+def test_several_clouds_give_a_list_and_batches_change_no_result(detector: Detector) -> None:
+    clouds = [small_cloud(0), small_cloud(1, 50), np.zeros((0, 4), np.float32), small_cloud(2), small_cloud(3, 900)]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".* has no points", DroppedWarning)
+        alone = [detector(cloud) for cloud in clouds]
+        # Five clouds in batches of two: the last one is filled with an empty cloud.
+        each, batched = detector(clouds), detector(iter(clouds), batch_size=2)
+    assert min(len(result) for result in (alone[0], alone[3], alone[4])) > 0
+    for one, same, other in zip(alone, each, batched, strict=True):
+        assert_same(same, one, 0)
+        assert_same(other, one, 1e-5)
+        assert other.seconds > 0
+    assert detector([]) == detector(iter([]), batch_size=4) == []
+
+
+def assert_same(result: FrameResult, expected: FrameResult, tolerance: float) -> None:
+    np.testing.assert_allclose(result.boxes, expected.boxes, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(result.scores, expected.scores, rtol=0, atol=tolerance)
+    assert (result.labels, result.counts) == (expected.labels, expected.counts)
+
+
+def test_clouds_are_taken_as_they_are_needed(detector: Detector, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken, batches = [], []
+    clouds = (taken.append(index) or small_cloud(index, 9) for index in range(5))
+    monkeypatch.setattr(Detector, "_detect", lambda self, batch, size: batches.append((len(taken), len(batch))) or [])
+    detector(clouds, batch_size=2)
+    assert batches == [(2, 2), (4, 2), (5, 1)]
+
+
+@pytest.mark.usefixtures("quiet")
+def test_every_cloud_may_have_its_own_frustum(detector: Detector) -> None:
+    clouds, everything = [small_cloud(0), small_cloud(1), small_cloud(2)], detector(small_cloud(1))
+    middle = np.median(everything.boxes[:, 0]) + 0.01
+    far = np.tile([1.0, 0.0, 0.0, -middle], (6, 1))
+    results = detector(clouds, frustum=[None, far, None], batch_size=2)
+    assert_same(results[0], detector(clouds[0]), 1e-5)
+    assert_same(results[1], detector(clouds[1], frustum=far), 1e-5)
+    for one, same in zip(
+        detector(clouds, frustum=far), [detector(cloud, frustum=far) for cloud in clouds], strict=True
+    ):
+        assert_same(one, same, 0)
+    assert 0 < len(results[1]) < len(everything)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_a_message_names_its_cloud(detector: Detector) -> None:
+    bright = small_cloud(1)
+    bright[7, 3] = 4
+    far = small_cloud(2) + np.float32([500, 0, 0, 0])
+    with pytest.warns() as caught:
+        detector([small_cloud(0), bright, far, bright], source=["a.bin", "b.bin", "c.bin", "d.bin"], batch_size=2)
+    told = [str(one.message) for one in caught if "candidates" not in str(one.message)]
+    assert [text.split(":")[0] for text in told] == ["b.bin", "d.bin", "c.bin"]
+    with pytest.raises(ValueError, match=r"^Cloud 1: points have the shape \(5, 3\); give \[N, 4\]"):
+        detector([small_cloud(), np.zeros((5, 3), np.float32)], batch_size=2)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"batch_size": 0}, "batch_size is 0; give a whole number of at least 1"),
+        ({"batch_size": 1.5}, "batch_size is 1.5; give a whole number of at least 1"),
+        ({"frustum": [None]}, r"points, frustum and source differ in length \(2 and 1\); give one of each"),
+        ({"frustum": np.zeros((5, 4))}, r"Cloud 0: its frustum has the shape \(5, 4\); give the planes \[6, 4\]"),
+        ({"source": ["a", "b", "c"]}, r"differ in length \(2 and 3\)"),
+    ],
+)
+@pytest.mark.usefixtures("no_type_checks")
+def test_what_cannot_be_a_batch_is_refused(detector: Detector, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=f"^.*{message}"):
+        detector([small_cloud(0), small_cloud(1)], **options)
+
+
+def test_warnings_point_to_the_line_of_the_caller(tmp_path: Path) -> None:
+    """Without the type checker of the tests, which adds calls."""
+    script = tmp_path / "script.py"
+    script.write_text(WARNING_SCRIPT)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    kinds = done.stdout.splitlines()
+    assert set(kinds) == {f"{kind} {script} detector(" for kind in ("DroppedWarning", "FormatWarning")}
+    assert len(kinds) >= 6
+
+
+# Reports the line of every warning; nothing is compiled.
+WARNING_SCRIPT = """
+import linecache, warnings
+import numpy as np
+import jax
+from ciassd_jax import Detections, Detector, tiny
+from ciassd_jax.model.network import variable_shapes
+from ciassd_jax.types import Boxes, Counts
+
+def none_found(variables, cloud, frustum):
+    none, stages = np.zeros(len(cloud.count), int), np.zeros((len(cloud.count), 3), int)
+    boxes = Boxes(*(np.zeros((len(none), 2, n)) for n in (3, 3)), np.zeros((len(none), 2)))
+    counts = Counts(cloud.count, none, none, none, none + 1, stages, stages, none, none)
+    return Detections(boxes, np.zeros((len(none), 2)), np.zeros((len(none), 2), int), none, counts)
+
+Detector.compile = lambda *_: none_found
+config = tiny()
+detector = Detector(jax.tree.map(lambda leaf: np.zeros(leaf.shape), variable_shapes(config)), config)
+points = np.random.default_rng(0).uniform([0, -6, -1, 0], [12, 6, 1, 1], (600, 4))
+points[3, 3] = 4
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    detector(points)
+    detector([points, points[:0]])
+    detector([points, points[:0]], batch_size=3)
+for one in caught:
+    line = linecache.getline(one.filename, one.lineno).strip()
+    print(one.category.__name__, one.filename, line[:9])
+"""
 
 
 @pytest.mark.usefixtures("quiet")
@@ -84,7 +191,7 @@ def test_points_that_are_not_finite_are_dropped_and_named(detector: Detector) ->
     spoilt = small_cloud()
     spoilt[[3, 5, 8], [0, 2, 3]] = [np.nan, np.inf, np.nan]
     clean = np.delete(small_cloud(), [3, 5, 8], 0)
-    with pytest.warns(DroppedWarning, match=r"^Dropped 3 of 600 points that are not finite") as caught:
+    with pytest.warns(DroppedWarning, match=r"^The cloud: dropped 3 of 600 points that are not finite") as caught:
         result = detector(spoilt)
     assert result.counts["points"]["dropped"] == 3
     assert "voxels" not in drops(caught)
@@ -117,7 +224,7 @@ def test_intensities_of_another_scale_are_refused_until_the_scale_is_given(detec
 
 @pytest.mark.parametrize("points", [np.zeros((0, 4), np.float32), np.full((9, 4), 500, np.float32) * [1, 1, 1, 0]])
 def test_nothing_in_range_gives_an_empty_result(detector: Detector, points: np.ndarray) -> None:
-    told = "Dropped all 9 points, none of which is in range" if len(points) else "The cloud has no points"
+    told = "The cloud: dropped all 9 points, none of which is in range" if len(points) else "The cloud has no points"
     with pytest.warns(DroppedWarning, match=f"^{told}.$"):
         result = detector(points)
     assert len(result) == 0

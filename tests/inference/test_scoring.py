@@ -37,7 +37,10 @@ class Oracle(Detector):
     def __init__(self, detect: Detect) -> None:
         self.config, self._find = CONFIG, detect
 
-    def __call__(self, points: Any, *, frustum: np.ndarray | None = None, source: str = "") -> FrameResult:
+    def __call__(self, points: Any, **options: Any) -> Any:
+        return [self._one(each) for each in points]
+
+    def _one(self, points: np.ndarray) -> FrameResult:
         boxes, labels = self._find(points)
         counts = {
             "points": {"given": len(points), "in_range": len(points), "dropped": 0, "invalid": 0},
@@ -226,8 +229,8 @@ def test_the_detector_is_told_the_frame(tmp_path: Path) -> None:
     sources = []
 
     class Recorder(Oracle):
-        def __call__(self, points: Any, *, source: str = "", **others: Any) -> FrameResult:
-            sources.append(source)
+        def __call__(self, points: Any, *, source: Any = None, **others: Any) -> Any:
+            sources.extend(source)
             return super().__call__(points, **others)
 
     detect_dataset(Recorder(nothing), open_dataset(write_custom(tmp_path, names=("a", "b")), "all"))
