@@ -11,7 +11,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
-from ciassd_jax.cli.options import Columns, MinScore, ScoreThreshold, open_simulated, read_columns
+from ciassd_jax.cli.options import Columns, Folder, MinScore, ScoreThreshold, WeightsFile, open_simulated, read_columns
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.formats.writing import check_folder, replacing
 from ciassd_jax.inference.detector import Detector
@@ -27,9 +27,9 @@ class Demo:
 
     file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")] = None
     """A cloud of your own instead of simulated ones."""
-    weights: Path = Path("car_lite")
+    weights: WeightsFile[Path] = Path("car_lite")
     """Weights file, or the name of bundled weights; the bundled ones were trained on simulated streets alone."""
-    out: Path = Path("ciassd_demo")
+    out: Folder[Path] = Path("ciassd_demo")
     """Folder for the results."""
     scenes: int = 3
     """Number of streets to simulate."""
@@ -49,7 +49,6 @@ class Demo:
             check_folder(self.out)
             frames = self._frames()
             detector = Detector(weights.variables, weights.config)
-            print("Compiling the detector; the compiled program is kept for the next run.", flush=True)
             detector.compile(max(len(frame.points) for frame in frames))
             written, shown = [], []
             for frame in frames:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from cli_files import TOUCHED, evil_pth, names_in
-from mini_folders import png_header
+from mini_folders import NAMES, png_header, write_custom, write_kitti, write_split
 from released import released_state
 from small import CALIBRATION, IMAGE_SIZE, small_cloud, small_config
 
@@ -41,7 +41,7 @@ def test_one_cloud_gives_json_and_a_table(run: Any, weights: Path, tmp_path: Pat
     assert (result.code, result.err) == (0, "")
     assert names_in(tmp_path / "out" / "deep") == ["street.json"]
     data = json.loads((tmp_path / "out" / "deep" / "street.json").read_text())
-    assert list(data) == ["boxes", "scores", "labels", "counts", "seconds"]
+    assert list(data) == ["box_columns", "boxes", "scores", "labels", "counts", "seconds"]
     count = len(data["scores"])
     assert count > 0
     assert np.shape(data["boxes"]) == (count, 7)
@@ -82,6 +82,80 @@ def test_all_formats_of_points_agree(run: Any, weights: Path, tmp_path: Path) ->
     assert re.fullmatch(rf"a\.bin: {len(boxes[0])} boxes, best 0\.\d\d, \d\.\d+ s", lines[0])
     assert summary.startswith(f"4 frames, {4 * len(boxes[0])} boxes, ")
     assert "4/4" not in result.err  # Only a terminal shows a progress bar.
+
+
+def boxes_in(folder: Path) -> dict[str, Any]:
+    return {path.stem: json.loads(path.read_text())["boxes"] for path in folder.glob("*.json")}
+
+
+def test_batches_give_the_same_boxes_in_order(run: Any, weights: Path, tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "clouds", {f"{name}.bin": small_cloud(name, 400).tobytes() for name in range(3)})
+    common = ("predict", folder, "--weights", weights)
+    assert run(*common, "--out", tmp_path / "alone").code == 0
+    result = run(*common, "--out", tmp_path / "batched", "--batch-size", 2)
+    assert (result.code, result.err) == (0, "")
+    *lines, summary = result.out.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["0.bin", "1.bin", "2.bin"]
+    assert re.search(r" s per frame without reading and compilation, in batches of 2; results are in ", summary)
+    alone, batched = boxes_in(tmp_path / "alone"), boxes_in(tmp_path / "batched")
+    assert alone.keys() == batched.keys()
+    for name, boxes in alone.items():
+        assert len(boxes) > 0
+        np.testing.assert_allclose(batched[name], boxes, atol=1e-5)
+
+
+def test_a_cloud_that_cannot_be_read_does_not_prevent_the_others(run: Any, weights: Path, tmp_path: Path) -> None:
+    bytes_as_intensity = (small_cloud() * np.float32([1, 1, 1, 255])).tobytes()
+    contents = {"0.bin": GOOD, "1.bin": GOOD[:-1], "2.bin": bytes_as_intensity, "3.npy": b"\x93NUMPY\1", "4.bin": GOOD}
+    folder = folder_of(tmp_path / "clouds", contents)
+    common = ("predict", folder, "--weights", weights, "--batch-size", 2)
+    result = run(*common, "--out", tmp_path / "out")
+    assert result.code == 2
+    assert sorted(boxes_in(tmp_path / "out")) == ["0", "4"]
+    assert result.out.splitlines()[-1].startswith("2 frames, ")
+    errors = result.err.splitlines()
+    # The sizes of all files are checked first.
+    assert [Path(re.match(r"error: (\S+?):? ", line)[1]).name for line in errors] == ["1.bin", "2.bin", "3.npy"]
+    assert "--intensity-scale" in errors[1]
+    for name, left in (("1.bin", set()), ("2.bin", {"0.json"}), ("3.npy", {"0.json"})):
+        strict = run(*common[:-1], 1, "--out", tmp_path / name, "--strict")
+        assert strict.code == 2
+        assert re.fullmatch(rf"error: \S+{name}:? .*\n", strict.err)
+        assert set(names_in(tmp_path / name) if left else ()) == left
+        (folder / name).unlink()
+
+
+@pytest.mark.parametrize("layout", ["kitti", "custom"])
+def test_the_frames_of_a_data_set_are_predicted(run: Any, weights: Path, tmp_path: Path, layout: str) -> None:
+    root = write_kitti(tmp_path / "data") if layout == "kitti" else write_custom(tmp_path / "data", NAMES)
+    write_split(root, "val", *NAMES[:0:-1])
+    # Labels are not read.
+    next(root.rglob("label*/000001.txt")).write_text("broken")
+    common = ("predict", root, "--weights", weights)
+    result = run(*common, "--split", "val", "--out", tmp_path / "val")
+    assert (result.code, result.err) == (0, "")
+    assert [line.split(".")[0] for line in result.out.splitlines()[:2]] == [*NAMES[:0:-1]]
+    written = [f"{name}.{suffix}" for name in NAMES[1:] for suffix in ("json", "txt")]
+    assert names_in(tmp_path / "val") == (written if layout == "kitti" else written[::2])
+    assert ("points that the camera does not see" in result.out) == (layout == "kitti")
+    assert run(*common, "--out", tmp_path / "all").code == 0
+    assert sorted(boxes_in(tmp_path / "all")) == list(NAMES)
+
+
+def test_pictures_and_a_page_are_written_on_demand(
+    run: Any, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, out = folder_of(tmp_path / "clouds", {"a.bin": GOOD, "b.bin": GOOD}), tmp_path / "out"
+    common = ("predict", folder, "--weights", weights, "--out", out)
+    result = run(*common, "--png", "--html")
+    assert (result.code, result.err) == (0, "")
+    assert names_in(out) == ["a.json", "a.png", "b.json", "b.png", "view.html"]
+    assert (out / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert result.out.endswith(f"{out / 'view.html'} shows all frames.\n")
+    monkeypatch.setattr("ciassd_jax.cli.predict._FRAMES_OF_PAGE", 1)
+    assert "view.html shows the first 1 of 2 frames; `ciassd view " in run(*common, "--html").out
+    one = run("predict", folder / "a.bin", "--weights", weights, "--out", out, "--png", "--html")
+    assert one.out.endswith(f"Wrote {out / 'a.json'} and {out / 'a.png'} and {out / 'view.html'}.\n")
 
 
 def expected_rows(data: Any) -> list[tuple[float, ...]]:
@@ -156,7 +230,7 @@ def test_what_was_dropped_is_one_line_with_the_file(run: Any, weights: Path, tmp
     assert result.code == 0
     lines = [line for line in re.split(r"[\r\n]+", result.err) if "warning" in line]
     assert lines[0] == f"warning: {folder / 'bright.bin'}: 1 of 600 intensities were clipped to [0, 1]."
-    assert lines[1].endswith("Dropped all 600 points, none of which is in range.")
+    assert lines[1] == f"warning: {folder / 'far.bin'}: dropped all 600 points, none of which is in range."
     assert lines[2] == f"warning: {folder / 'nan.bin'}: 5 of 600 points are not finite; they were left out."
     assert lines[3].startswith(f"warning: {folder / 'xyz.npy'} has no intensity")
     assert len(lines) == 4
@@ -180,9 +254,9 @@ def test_other_warnings_are_left_alone(run: Any, weights: Path, tmp_path: Path, 
 def test_threshold_and_dtype_override_the_file(run: Any, weights: Path, tmp_path: Path, monkeypatch: Any) -> None:
     configs = []
 
-    def detect(detector: Detector, points: Any, **options: Any) -> FrameResult:
+    def detect(detector: Detector, points: Any, **options: Any) -> list[FrameResult]:
         configs.append(detector.config)
-        return FrameResult(np.zeros((0, 7)), np.zeros(0), (), {}, 0.0)
+        return [FrameResult(np.zeros((0, 7)), np.zeros(0), (), {}, 0.0)]
 
     write_bin(tmp_path / "a.bin", small_cloud())
     monkeypatch.setattr("ciassd_jax.inference.detector.Detector.__call__", detect)
@@ -226,9 +300,16 @@ BAD: dict[str, tuple[Callable[[Path], dict[str, Any]], str]] = {
         lambda t: {"path": folder_of(t / "d", {"a.bin": GOOD, "a.npy": GOOD})},
         r"a\.bin and .*a\.npy .*a\.json; rename one",
     ),
-    "one of a folder": (
-        lambda t: {"path": folder_of(t / "d", {"0.bin": GOOD, "1.bin": GOOD[:-1]})},
-        r"1\.bin .*9599 bytes",
+    "all of a folder": (lambda t: {"path": folder_of(t / "d", {"1.bin": GOOD[:-1]})}, r"1\.bin .*9599 bytes"),
+    "batch size": (lambda t: {"batch-size": 0}, r"--batch-size is 0; detect at least 1 cloud at once"),
+    "split of a file": (lambda t: {"split": "val"}, r"--split is for the root of a data set, .*good\.bin is not"),
+    "calibration of a data set": (
+        lambda t: {"path": write_kitti(t / "kitti"), "calib": t},
+        r"kitti has its own calibrations; leave out --calib",
+    ),
+    "unknown split": (
+        lambda t: {"path": write_kitti(t / "kitti"), "split": "mine"},
+        r"mine\.txt does not exist; write it",
     ),
     "missing weights": (lambda t: {"weights": t / "w.safetensors"}, r"w\.safetensors .*; check the path"),
     "cut weights": (

@@ -54,7 +54,11 @@ ACT = """<script>
       truth: element("truth-count").textContent,
       found: element("found-count").textContent,
       points: traces.points.x.length,
-      trueVertices: vertices(traces.truth),
+      trueVertices: [...vertices(traces.truth), ...vertices(traces.dimmed)],
+      dimmedVertices: vertices(traces.dimmed),
+      dimmed: element("dimmed").hidden ? "" : element("dimmed").textContent,
+      captions: document.getElementById("scene").layout.scene.annotations.map((one) => one.text),
+      written: [...document.querySelectorAll("figure text")].map((one) => one.textContent),
       foundVertices: vertices(traces.found),
       said: [...new Set(traces.found.text)].filter(Boolean),
       image: document.querySelectorAll("figure path.found").length,
@@ -72,6 +76,7 @@ ACT = """<script>
     next: () => element("next").click(),
     back: () => document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowLeft", bubbles: true })),
     above: () => element("above").click(),
+    bare: () => element("captions").click(),
   };
   async function act() {
     const seen = {};
@@ -115,7 +120,8 @@ def make_page(folder: Path) -> Page:
     (folder / "calib.txt").write_text(CALIBRATION)
     camera = read_camera(folder / "calib.txt", image_size=IMAGE_SIZE)
     image = np.full((480, 640, 3), 120, np.uint8)
-    first = ViewFrame("first", street(0), BOXES, SCORES, LABELS, BOXES[:2] + 0.1, ("Car", "Car"), camera, image)
+    first = ViewFrame("first", street(0), BOXES, SCORES, LABELS, BOXES[:2] + 0.1, ("Car", "Tram"), camera, image)
+    first = first._replace(is_target=np.array([True, False]))
     spoilt = street(1)
     spoilt[0, 0] = np.nan
     with pytest.warns(UserWarning, match="1 of 6,000 points"):
@@ -176,6 +182,22 @@ def test_hovering_tells_class_score_size_and_distance(seen: dict[str, Any]) -> N
         "10.2 m away, yaw 17°",
     ]
     assert "prediction: &lt;b>Van&lt;/b>" in seen["first"]["said"][1]
+
+
+def test_captions_name_each_visible_box_until_they_are_switched_off(seen: dict[str, Any]) -> None:
+    truth, found = ["Car", "Tram"], ["Car 0.90", "&lt;b>Van&lt;/b> 0.50", "Car 0.20"]
+    assert seen["first"]["captions"] == truth + found
+    assert seen["first"]["written"] == [text.replace("&lt;", "<") for text in truth + found]
+    assert seen["hidden"]["captions"] == found[:2]
+    assert seen["above"]["captions"] != []
+    assert seen["bare"]["captions"] == seen["bare"]["written"] == []
+
+
+def test_truth_that_is_no_target_is_dimmed(seen: dict[str, Any]) -> None:
+    expected = corners(outline_boxes(BOXES[1:2] + 0.1).reshape(-1, 3))
+    np.testing.assert_allclose(corners(seen["first"]["dimmedVertices"]), expected, atol=2e-3)
+    assert seen["first"]["dimmed"] == "no target 1"
+    assert seen["hidden"]["dimmedVertices"] == []
 
 
 def test_the_score_slider_hides_boxes_in_space_and_image(seen: dict[str, Any]) -> None:
