@@ -12,7 +12,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
-from ciassd_jax.cli.options import SIMULATED, Columns, Unset, open_simulated, read_columns
+from ciassd_jax.cli.options import SIMULATED, Columns, File, Unset, WeightsFile, open_simulated, read_columns
 from ciassd_jax.data.clouds import find_clouds, read_cloud
 from ciassd_jax.formats.writing import check_folder, write_text
 from ciassd_jax.inference.timing import time_detection
@@ -28,7 +28,7 @@ class Bench:
     Without options it times the bundled weights on simulated streets.
     """
 
-    weights: Path = Path("car_lite")
+    weights: WeightsFile[Path] = Path("car_lite")
     """Weights file (.safetensors, or a released .pth), or the name of bundled weights."""
     data: Annotated[str, tyro.conf.arg(metavar="FOLDER|FILE|simulated")] = SIMULATED
     """A cloud, a folder of clouds, or the LiDAR simulator."""
@@ -36,7 +36,7 @@ class Bench:
     """Clouds per call."""
     repeats: int = 50
     """Calls that are timed."""
-    json: Unset[Path] = None
+    json: File[Unset[Path]] = None
     """Also write the numbers to this file."""
     columns: Columns = None
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)

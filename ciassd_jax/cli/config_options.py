@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import tyro
 
 from ciassd_jax.cli.messages import UsageError, option_of, values_from_options
-from ciassd_jax.cli.options import Unset
+from ciassd_jax.cli.options import File, Unset
 from ciassd_jax.config import Config
 from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.inference.scoring import find_trained
@@ -41,7 +41,7 @@ class ConfigOptions:
 
     preset: Unset[Preset] = None
     """Use the config of this preset. With weights, the parameters must fit."""
-    config: Unset[Path] = None
+    config: File[Unset[Path]] = None
     """Or that of a file: a config.json or weights. --config.SECTION.FIELD VALUE replaces a field (--help-config)."""
     intensity_scale: Unset[float] = None
     """The intensity in the clouds that the network reads as 1, such as 255. Training keeps it with the weights."""

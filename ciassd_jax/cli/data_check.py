@@ -12,7 +12,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import describe, frames_with_bar
-from ciassd_jax.cli.options import Columns, ImageSize, Unset, read_columns
+from ciassd_jax.cli.options import Columns, ImageSize, Split, Unset, read_columns
 from ciassd_jax.evaluation.class_check import LabelScore
 from ciassd_jax.evaluation.dataset_check import Report, check_dataset
 from ciassd_jax.evaluation.frame_check import Finding
@@ -25,7 +25,7 @@ class Check:
 
     root: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")] = None
     """Folder in KITTI's or OpenPCDet's custom layout; by default the variable KITTI_ROOT."""
-    split: Unset[str] = None
+    split: Split[Unset[str]] = None
     """train, val, trainval, test, or a file that lists frames. Default: every frame and all split files."""
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     image_size: ImageSize = None

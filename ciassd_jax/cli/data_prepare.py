@@ -10,7 +10,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lines
-from ciassd_jax.cli.options import Columns, ImageSize, Unset, read_columns
+from ciassd_jax.cli.options import Columns, Folder, ImageSize, Split, Unset, read_columns
 from ciassd_jax.config import Config
 from ciassd_jax.data.folders import find_root, is_custom, open_dataset
 from ciassd_jax.data.gt_sampling import (
@@ -30,9 +30,9 @@ class Prepare:
 
     root: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")] = None
     """Folder in KITTI's or OpenPCDet's custom layout; by default the variable KITTI_ROOT."""
-    split: str = "train"
+    split: Split[str] = "train"
     """The frames whose objects are collected."""
-    out: Unset[Path] = None
+    out: Folder[Unset[Path]] = None
     """Folder for the database. Default: the data set's own."""
     reduce: bool = False
     """First crop the full clouds of a KITTI folder to the camera's view, and write them to velodyne_reduced."""

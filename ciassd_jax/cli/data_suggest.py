@@ -11,7 +11,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import describe, frames_with_bar, warnings_as_lines
-from ciassd_jax.cli.options import Columns, ImageSize, Unset, read_columns
+from ciassd_jax.cli.options import Columns, File, ImageSize, Split, Unset, read_columns
 from ciassd_jax.data.folders import find_root, open_dataset
 from ciassd_jax.data.splits import ALL
 from ciassd_jax.evaluation.suggest import suggest_config
@@ -24,14 +24,14 @@ class Suggest:
 
     root: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")] = None
     """Folder in KITTI's or OpenPCDet's custom layout; by default the variable KITTI_ROOT."""
-    split: str = ALL
+    split: Split[str] = ALL
     """The frames to fit: train, val, trainval, all, or a file that lists them."""
     classes: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TYPE [TYPE ...]", help_behavior_hint="")] = None
     """The types to learn. Default: all with at least 5 % of the objects."""
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     image_size: ImageSize = None
     columns: Columns = None
-    out: Unset[Path] = None
+    out: File[Unset[Path]] = None
     """Write the config to this file instead."""
 
     def run(self) -> int:

@@ -97,9 +97,7 @@ def _versions() -> Iterator[Finding]:
     """Are the packages new enough, and did the tests run with them?"""
     needed = {name: least for name, least, extra in _requirements() if not extra}
     found = {"python": platform.python_version()} | {name: version(name) for name in ("ciassd_jax", "jaxlib", *needed)}
-    yield Finding(
-        "ok", ", ".join(f"{name} {found[name]}" for name in ("ciassd_jax", *_TESTED) if name in found)
-    )
+    yield Finding("ok", ", ".join(f"{name} {found[name]}" for name in ("ciassd_jax", *_TESTED) if name in found))
     for name, least in needed.items():
         if _number(found[name]) < _number(least):
             remedy = f"pip install -U '{name}>={least}'"

@@ -10,6 +10,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError
+from ciassd_jax.cli.options import WeightsFile
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.inference.detector import SMALLEST_BUCKET
 from ciassd_jax.inference.export import export_predict
@@ -24,7 +25,7 @@ class Export:
 
     out: Annotated[Path, tyro.conf.Positional]
     """The file to write, such as car.ciassd."""
-    weights: Path
+    weights: WeightsFile[Path]
     """Weights file (.safetensors, or a released .pth), or the name of bundled weights."""
     platforms: tuple[Literal["cpu", "cuda", "tpu"], ...] = ("cpu", "cuda", "tpu")
     """Where the program is to run."""

@@ -12,7 +12,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import frames_with_bar, option_of, warnings_as_lines
-from ciassd_jax.cli.options import Frames, Unset
+from ciassd_jax.cli.options import Frames, Split, Unset, WeightsFile
 from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.inference import cost
@@ -29,10 +29,10 @@ class Info:
     """
 
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
-    weights: Unset[Path] = None
+    weights: WeightsFile[Unset[Path]] = None
     """Show the config of this weights file, or of the bundled weights of this name."""
     data_set: Annotated[Frames, tyro.conf.OmitArgPrefixes] = field(default_factory=Frames)
-    split: str = "train"
+    split: Split[str] = "train"
     """The frames that are compared with the grid."""
     seed: int = 0
     """Seed of simulated frames."""

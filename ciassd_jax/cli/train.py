@@ -15,7 +15,7 @@ import tyro
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.initial_weights import describe_taken, find_unloaded
 from ciassd_jax.cli.messages import UsageError, frames_with_bar, values_from_options, warnings_as_lines
-from ciassd_jax.cli.options import Dtype, Frames, Unset
+from ciassd_jax.cli.options import Dtype, Epochs, Folder, Frames, Split, Steps, Unset, WeightsFile
 from ciassd_jax.config import Config, ScheduleConfig
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.data.gt_sampling import ObjectDatabase, database_path, find_database
@@ -45,29 +45,29 @@ class Train:
     and --num-processes. SLURM and TPU pods need none of the three.
     """
 
-    workdir: Path
+    workdir: Folder[Path]
     """Folder for everything that is written: config, metrics, checkpoints, evaluations, weights."""
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     data_set: Annotated[Frames, tyro.conf.OmitArgPrefixes] = field(default_factory=Frames)
-    split: str = "train"
+    split: Split[str] = "train"
     """The frames to train on: train, trainval, all or a file of ImageSets."""
-    validate: str = "val"
+    validate: Split[str] = "val"
     """The split to evaluate on; none for no evaluation."""
-    init_from: Unset[Path] = None
+    init_from: WeightsFile[Unset[Path]] = None
     """Weights to start from, by default with their config: a .safetensors, a released .pth, or bundled ones by name."""
     partial: bool = False
     """Take the tensors of --init-from that fit the config, for other classes or another range; draw the others."""
     freeze: Annotated[Unset[tuple[str, ...]], tyro.conf.arg(metavar="PART ...")] = None
     """Parts of the network that keep their parameters and statistics, such as backbone or neck/spatial_0."""
-    overfit_one: Unset[str] = None
+    overfit_one: Annotated[Unset[str], tyro.conf.arg(metavar="FRAME")] = None
     """Train on this frame alone without augmentation, to check that the model can overfit it; exit code 1 if not."""
     seed: int = 0
     """Seed of the weights, of the order of frames and their augmentation, and of simulated frames."""
-    steps: Unset[int] = None
+    steps: Steps[Unset[int]] = None
     """Number of steps in all."""
-    epochs: Unset[int] = None
+    epochs: Epochs[Unset[int]] = None
     """Or the number of passes over the frames."""
-    batch_size: Unset[int] = None
+    batch_size: Annotated[Unset[int], tyro.conf.arg(metavar="SCENES")] = None
     """Scenes per step."""
     workers: int = 0
     """Processes that read frames; with 0 a thread reads them."""
@@ -79,22 +79,22 @@ class Train:
     """Peak learning rate."""
     weight_decay: Unset[float] = None
     """Decoupled weight decay of all parameters."""
-    gradient_accumulation_steps: Unset[int] = None
+    gradient_accumulation_steps: Steps[Unset[int]] = None
     """Steps whose gradients are averaged for one update."""
     ema_decay: Unset[float] = None
     """Decay of the moving average of the weights, which evaluation then uses; 0 for none."""
     remat: Unset[bool] = None
     """Recompute activations in the backward pass: less memory, more time."""
-    log_every: int = 50
+    log_every: Steps[int] = 50
     """Steps between two lines of metrics.jsonl."""
-    save_every: int = 1000
+    save_every: Steps[int] = 1000
     """Steps between two checkpoints."""
-    evaluate_every: int = 10
+    evaluate_every: Epochs[int] = 10
     """Epochs between two evaluations; 0 for no evaluation."""
     keep: int = 3
     """Number of recent checkpoints to keep, besides the best."""
-    coordinator: Unset[str] = None
-    """HOST:PORT of process 0 if several processes train together; "auto" for any cluster that JAX recognises."""
+    coordinator: Annotated[Unset[str], tyro.conf.arg(metavar="HOST:PORT|auto")] = None
+    """Process 0 if several processes train together; auto for any cluster that JAX recognises."""
     num_processes: Unset[int] = None
     """Number of processes that train together."""
     process_index: Unset[int] = None

@@ -16,10 +16,14 @@ from ciassd_jax.cli.messages import UsageError, frames_with_bar, warnings_as_lin
 from ciassd_jax.cli.options import (
     SIMULATED,
     Columns,
+    File,
+    Folder,
     ImageSize,
     MinScore,
     ScoreThreshold,
+    Split,
     Unset,
+    WeightsFile,
     open_simulated,
     read_columns,
 )
@@ -40,17 +44,17 @@ class View:
 
     path: Annotated[str, tyro.conf.Positional]
     """A cloud, a folder of clouds, a data set in KITTI's or OpenPCDet's custom layout, or the word simulated."""
-    out: Path = Path("view.html")
+    out: File[Path] = Path("view.html")
     """The page to write."""
-    weights: Unset[Path] = None
+    weights: WeightsFile[Unset[Path]] = None
     """Detect objects with these weights."""
-    results: Unset[Path] = None
+    results: Folder[Unset[Path]] = None
     """Or show the detections that `ciassd predict` or `ciassd eval --out` wrote to this folder: NAME.json or .txt."""
     frames: int = 20
     """Number of frames to show, the first ones, or to simulate."""
     names: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")] = ()
     """Or the names of the frames to show."""
-    split: str = "all"
+    split: Split[str] = "all"
     """The frames of a data set: all, train, val, trainval, test or a file of ImageSets."""
     seed: int = 0
     """Seed of simulated frames."""
