@@ -35,7 +35,7 @@ def run(study: Study) -> Report:
         overlap = nearest_overlap(truth, found) if len(result) and len(truth.yaw) else np.zeros(len(truth.yaw))
         matched = int((overlap >= MATCHED).sum())
         rows.append({"frame": frame.name, "cars": len(truth.yaw), "detections": len(result), "cars found": matched})
-        boxes = result.boxes, np.asarray(truth.to_array()), result.scores
+        boxes = result.boxes, np.asarray(truth.to_array()), result.scores, result.labels
         figures[f"{frame.name}_above"] = plot_bev(frame.points, *boxes, title=frame.name)
         source = read_source(sources[frame.name], image=True) if frame.name in sources else None
         if source is not None and source.image is not None and frame.camera is not None:
