@@ -27,7 +27,7 @@ from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.inference.programs import compile_program
 from ciassd_jax.inference.scoring import TRAINED
 from ciassd_jax.inference.weights import save_weights
-from ciassd_jax.model.network import variables_of
+from ciassd_jax.model.checks import variables_of
 from ciassd_jax.training import distributed
 from ciassd_jax.training.checkpoint import Checkpoints
 from ciassd_jax.training.progress import Progress

@@ -19,7 +19,8 @@ from small import random_variables, small_config
 from ciassd_jax import create_train_state
 from ciassd_jax.data.loader import LoaderState
 from ciassd_jax.formats.errors import FormatWarning, InputError
-from ciassd_jax.training.checkpoint import Checkpoints, first_difference
+from ciassd_jax.model.checks import variables_of
+from ciassd_jax.training.checkpoint import Checkpoints, checkpoint_steps, checkpoint_variables, first_difference
 from ciassd_jax.types import TrainState
 
 CONFIG = replace(small_config(), schedule=replace(small_config().schedule, ema_decay=0.9))
@@ -56,6 +57,32 @@ def test_the_last_and_the_best_are_kept_and_restored(tmp_path: Path, state: Trai
     assert restored is not None
     assert (restored.loader, restored.score) == (LOADER._replace(batch=10), None)
     assert_same_bits(restored.state, at(state, 10))
+
+
+def test_the_weights_of_a_checkpoint_are_read_alone(tmp_path: Path, state: TrainState) -> None:
+    save(tmp_path, state, {2: 1.0, 4: None})
+    # What a running training writes is left alone.
+    (tmp_path / "6.orbax-checkpoint-tmp").mkdir()
+    assert checkpoint_steps(tmp_path) == [2, 4]
+    variables = checkpoint_variables(tmp_path, 4)
+    jax.tree.map(np.testing.assert_array_equal, variables, variables_of(at(state, 4)))
+    assert (tmp_path / "6.orbax-checkpoint-tmp").is_dir()
+    _empty_data(tmp_path / "4")
+    with pytest.raises(InputError, match=r"/4 cannot be read \(.*\); remove this folder to evaluate the others\.$"):
+        checkpoint_variables(tmp_path, 4)
+
+
+def test_without_a_moving_average_the_parameters_are_read(tmp_path: Path, state: TrainState) -> None:
+    config = replace(CONFIG, schedule=replace(CONFIG.schedule, ema_decay=0.0))
+    with Checkpoints(tmp_path, config) as checkpoints:
+        checkpoints.save(state._replace(ema=None), LOADER)
+    variables = checkpoint_variables(tmp_path, 0)
+    jax.tree.map(np.testing.assert_array_equal, variables, variables_of(state._replace(ema=None)))
+
+
+def test_a_folder_without_checkpoints_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="has no checkpoint; give the folder of a training"):
+        checkpoint_steps(tmp_path / "absent")
 
 
 def test_an_empty_folder_has_no_checkpoint(tmp_path: Path, state: TrainState) -> None:

@@ -35,6 +35,7 @@ from ciassd_jax.training.checkpoint import Checkpoints
 from ciassd_jax.training.loop import Fitted, Intervals, TrainingError, fit
 from ciassd_jax.training.record import Record
 from ciassd_jax.training.signals import deferred_signals
+from ciassd_jax.training.validation import score_checkpoints
 from ciassd_jax.types import TrainState
 
 
@@ -130,6 +131,15 @@ def test_the_weights_are_those_of_the_last_step(whole: tuple[Fitted, Path, list[
     # The moving average of the weights, which this config asks for.
     jax.tree.map(np.testing.assert_array_equal, weights.variables, variables_of(fitted.state))
     assert_same_bits(saved_state(workdir), fitted.state)
+
+
+def test_checkpoints_score_as_in_training(whole: tuple[Fitted, Path, list[str]], root: Path) -> None:
+    _, workdir, _ = whole
+    scores = score_checkpoints(workdir, open_dataset(root, "val"), mini_config())
+    assert {8, 9} <= set(scores)
+    every = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
+    (in_training,) = [line for line in every if line["step"] == 9 and "score" in line]
+    assert scores[9] == {name: in_training[name] for name in scores[9]}
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 from ciassd_jax.config import ClassConfig
 from ciassd_jax.config.presets import car
 from ciassd_jax.evaluation import DetectedObjects, Evaluation, LabelledObjects, evaluate, limits_of
-from ciassd_jax.training.validation import precisions
+from ciassd_jax.training.validation import describe_score, format_scores, precisions
 from ciassd_jax.types import Boxes
 
 CONFIG = replace(car(), classes=(ClassConfig(name="Car"), ClassConfig(name="Forklift", eval_overlap=0.4)))
@@ -51,3 +51,18 @@ def test_a_class_without_detections_counts_as_0() -> None:
 def test_with_cars_only_the_score_is_theirs() -> None:
     numbers = precisions(an_evaluation(car(), {"Car": 30}), car())
     assert numbers["score"] == numbers["Car_3d_0.70_hard_R40"] > 0
+
+
+def test_scores_of_checkpoints_are_one_table() -> None:
+    numbers = precisions(an_evaluation(CONFIG, {"Car": 41, "Forklift": 0}), CONFIG)
+    assert format_scores({8: numbers | {"score": 7.0}, 1000: numbers}).splitlines() == [
+        "AP in percent, hard, R40; the score is the mean in 3D",
+        "    step   score   Car 3D 0.70   Car BEV 0.70   Forklift 3D 0.40   Forklift BEV 0.40",
+        "       8    7.00        100.00         100.00               0.00                0.00",
+        "    1000   50.00        100.00         100.00               0.00                0.00   best",
+    ]
+
+
+def test_a_score_in_a_few_words() -> None:
+    numbers = precisions(an_evaluation(CONFIG, {"Car": 41, "Forklift": 0}), CONFIG) | {"detections": 9}
+    assert describe_score(numbers) == "AP 50.00 (Car 100.00, Forklift 0.00), 9 detections"
