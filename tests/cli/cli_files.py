@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import re
 import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +14,11 @@ class Run(NamedTuple):
     code: int
     out: str
     err: str
+
+    @property
+    def complaints(self) -> str:
+        """All of stderr but the lines that announce a compilation."""
+        return re.sub(r"Compiling .*, once\.\n", "", self.err)
 
 
 class Evil:

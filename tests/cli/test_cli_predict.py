@@ -38,7 +38,7 @@ def kitti(tmp_path: Path) -> Path:
 def test_one_cloud_gives_json_and_a_table(run: Any, weights: Path, tmp_path: Path) -> None:
     write_bin(tmp_path / "street.bin", small_cloud())
     result = run("predict", tmp_path / "street.bin", "--weights", weights, "--out", tmp_path / "out" / "deep")
-    assert (result.code, result.err) == (0, "")
+    assert (result.code, result.complaints) == (0, "")
     assert names_in(tmp_path / "out" / "deep") == ["street.json"]
     data = json.loads((tmp_path / "out" / "deep" / "street.json").read_text())
     assert list(data) == ["box_columns", "boxes", "scores", "labels", "counts", "seconds"]
@@ -93,7 +93,7 @@ def test_batches_give_the_same_boxes_in_order(run: Any, weights: Path, tmp_path:
     common = ("predict", folder, "--weights", weights)
     assert run(*common, "--out", tmp_path / "alone").code == 0
     result = run(*common, "--out", tmp_path / "batched", "--batch-size", 2)
-    assert (result.code, result.err) == (0, "")
+    assert (result.code, result.complaints) == (0, "")
     *lines, summary = result.out.splitlines()
     assert [line.split(":")[0] for line in lines] == ["0.bin", "1.bin", "2.bin"]
     assert re.search(r" s per frame without reading and compilation, in batches of 2; results are in ", summary)
@@ -113,14 +113,14 @@ def test_a_cloud_that_cannot_be_read_does_not_prevent_the_others(run: Any, weigh
     assert result.code == 2
     assert sorted(boxes_in(tmp_path / "out")) == ["0", "4"]
     assert result.out.splitlines()[-1].startswith("2 frames, ")
-    errors = result.err.splitlines()
+    errors = result.complaints.splitlines()
     # The sizes of all files are checked first.
     assert [Path(re.match(r"error: (\S+?):? ", line)[1]).name for line in errors] == ["1.bin", "2.bin", "3.npy"]
     assert "--intensity-scale" in errors[1]
     for name, left in (("1.bin", set()), ("2.bin", {"0.json"}), ("3.npy", {"0.json"})):
         strict = run(*common[:-1], 1, "--out", tmp_path / name, "--strict")
         assert strict.code == 2
-        assert re.fullmatch(rf"error: \S+{name}:? .*\n", strict.err)
+        assert re.fullmatch(rf"error: \S+{name}:? .*\n", strict.complaints)
         assert set(names_in(tmp_path / name) if left else ()) == left
         (folder / name).unlink()
 
@@ -133,7 +133,7 @@ def test_the_frames_of_a_data_set_are_predicted(run: Any, weights: Path, tmp_pat
     next(root.rglob("label*/000001.txt")).write_text("broken")
     common = ("predict", root, "--weights", weights)
     result = run(*common, "--split", "val", "--out", tmp_path / "val")
-    assert (result.code, result.err) == (0, "")
+    assert (result.code, result.complaints) == (0, "")
     assert [line.split(".")[0] for line in result.out.splitlines()[:2]] == [*NAMES[:0:-1]]
     written = [f"{name}.{suffix}" for name in NAMES[1:] for suffix in ("json", "txt")]
     assert names_in(tmp_path / "val") == (written if layout == "kitti" else written[::2])
@@ -148,7 +148,7 @@ def test_pictures_and_a_page_are_written_on_demand(
     folder, out = folder_of(tmp_path / "clouds", {"a.bin": GOOD, "b.bin": GOOD}), tmp_path / "out"
     common = ("predict", folder, "--weights", weights, "--out", out)
     result = run(*common, "--png", "--html")
-    assert (result.code, result.err) == (0, "")
+    assert (result.code, result.complaints) == (0, "")
     assert names_in(out) == ["a.json", "a.png", "b.json", "b.png", "view.html"]
     assert (out / "a.png").read_bytes().startswith(b"\x89PNG")
     assert result.out.endswith(f"{out / 'view.html'} shows all frames.\n")
@@ -170,7 +170,7 @@ def test_calibration_beside_the_cloud_gives_kitti_rows(run: Any, weights: Path, 
     out = tmp_path / "out"
     cloud = kitti / "velodyne_reduced" / "000007.bin"
     result = run("predict", cloud, "--weights", weights, "--out", out, "--image-size", *IMAGE_SIZE)
-    assert (result.code, result.err) == (0, "")
+    assert (result.code, result.complaints) == (0, "")
     assert names_in(out) == ["000007.json", "000007.txt"]
     data = json.loads((out / "000007.json").read_text())
     rows = read_rows(out / "000007.txt")
