@@ -34,6 +34,7 @@ _ELSEWHERE = {
     "--amp --fp16": ("use --dtype bfloat16",),
     "--sync-bn": ("batch statistics are pooled over all devices without an option",),
     "--no-validate": ("use --validate none",),
+    "--eval-all": ("--all",),
     "--ckpt-save-interval": ("--save-every",),
     "--max-ckpt-save-num": ("--keep",),
     "--gpus --gpu-ids --device": ("JAX uses the GPUs that CUDA_VISIBLE_DEVICES lists, and JAX_PLATFORMS=cpu none",),
