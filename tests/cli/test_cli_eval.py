@@ -221,7 +221,7 @@ BAD: dict[str, tuple[Change, str]] = {
         lambda w: {"weights": None, "workdir": w / "kitti"},
         r"kitti has neither best\.safetensors nor last\.safetensors",
     ),
-    "another config": (lambda w: {"preset": "car"}, r"--preset car .*another config: .* tensors "),
+    "another config": (lambda w: {"preset": "car"}, r"does not fit the config in .* tensors: .*; leave out --preset"),
     "threshold": (lambda w: {"score-threshold": 1.5}, r"--config\.detection\.score-threshold\): 1\.5 is outside"),
     "no data": (lambda w: {"data": w / "none"}, r"none has no folder training or testing \(KITTI\) or points"),
     "no split": (lambda w: {"split": "mine"}, r"ImageSets/mine\.txt does not exist; write it"),
