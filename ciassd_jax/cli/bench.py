@@ -12,7 +12,18 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
-from ciassd_jax.cli.options import SIMULATED, Columns, File, Unset, WeightsFile, open_simulated, read_columns
+from ciassd_jax.cli.options import (
+    SIMULATED,
+    BatchSize,
+    Columns,
+    File,
+    ImageSize,
+    Unset,
+    WeightsFile,
+    check_batch_size,
+    open_simulated,
+    read_columns,
+)
 from ciassd_jax.data.clouds import find_clouds, read_cloud
 from ciassd_jax.formats.writing import check_folder, write_text
 from ciassd_jax.inference.timing import time_detection
@@ -31,20 +42,20 @@ class Bench:
     weights: WeightsFile[Path] = Path("car_lite")
     """Weights file (.safetensors, or a released .pth), or the name of bundled weights."""
     data: Annotated[str, tyro.conf.arg(metavar="FOLDER|FILE|simulated")] = SIMULATED
-    """A cloud, a folder of clouds, or the LiDAR simulator."""
-    batch_size: int = 1
-    """Clouds per call."""
-    repeats: int = 50
-    """Calls that are timed."""
+    """A cloud, a folder of clouds, a data set, or the LiDAR simulator."""
+    image_size: ImageSize = None
+    batch_size: BatchSize = 1
+    repeats: Annotated[int, tyro.conf.arg(metavar="CALLS")] = 50
+    """Number of calls that are timed."""
     json: File[Unset[Path]] = None
     """Also write the numbers to this file."""
     columns: Columns = None
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 
     def run(self) -> int:
-        for name, value in (("--batch-size", self.batch_size), ("--repeats", self.repeats)):
-            if value < 1:
-                raise UsageError(f"{name} is {value}; give at least 1.")
+        check_batch_size(self.batch_size)
+        if self.repeats < 1:
+            raise UsageError(f"--repeats is {self.repeats}; time at least 1 call.")
         if self.json is not None:
             check_folder(self.json.parent)
         with warnings_as_lines(self.data):
@@ -64,7 +75,7 @@ class Bench:
             streets = open_simulated("all", number, seed=0)
             return [streets.read(index).points for index in range(number)]
         columns = read_columns(self.columns)
-        files = find_clouds(self.data, columns=columns)
+        files = find_clouds(self.data, image_size=self.image_size, columns=columns)
         chosen = np.unique(np.linspace(0, len(files) - 1, number).astype(int)).tolist()
         return [read_cloud(files[index], columns)[0] for index in chosen]
 

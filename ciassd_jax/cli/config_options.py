@@ -159,6 +159,6 @@ def _source(arguments: Sequence[str]) -> Config:
     weights = named.weights or named.init_from
     if arguments[0] == "eval" and named.workdir is not None:
         weights = find_trained(named.workdir)
-    if arguments[0] == "demo" and weights is None:
+    if arguments[0] in ("demo", "bench") and weights is None:
         weights = Path("car_lite")
     return named.config_options.chosen(read_config(find_weights(weights)) if weights else None)

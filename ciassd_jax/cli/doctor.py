@@ -232,7 +232,7 @@ def _forward() -> Iterator[Finding]:
     """Does a forward pass give the stored result?"""
     start = time.perf_counter()
     voxels, means = forward()
-    worst = max(abs(means[name] / mean - 1) for name, mean in _MEANS.items())
+    worst = float(np.max([abs(means[name] / mean - 1) for name, mean in _MEANS.items()]))
     if voxels != _VOXELS or not worst <= _TOLERANCE:
         raise ValueError(f"{voxels} voxels instead of {_VOXELS}, outputs {worst:.1e} off")
     seconds = time.perf_counter() - start

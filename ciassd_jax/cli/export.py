@@ -29,9 +29,9 @@ class Export:
     """Weights file (.safetensors, or a released .pth), or the name of bundled weights."""
     platforms: tuple[Literal["cpu", "cuda", "tpu"], ...] = ("cpu", "cuda", "tpu")
     """Where the program is to run."""
-    batch: int = 1
-    """Clouds per call."""
-    points: int = SMALLEST_BUCKET
+    batch: Annotated[int, tyro.conf.arg(metavar="CLOUDS")] = 1
+    """Number of clouds per call."""
+    points: Annotated[int, tyro.conf.arg(metavar="POINTS")] = SMALLEST_BUCKET
     """The most points of a cloud."""
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 

@@ -9,7 +9,7 @@ alone, without this package:
     import numpy as np
     from jax import export
 
-    with zipfile.ZipFile("car.ciassd") as file:
+    with zipfile.ZipFile("car_lite.ciassd") as file:
         manifest = json.loads(file.read("manifest.json"))
         detect = jax.jit(export.deserialize(bytearray(file.read("program.bin"))).call)
     points, count, frustum = (np.zeros(one["shape"], one["type"]) for one in manifest["inputs"])
@@ -17,7 +17,7 @@ alone, without this package:
     points[0, : len(cloud)], count[0] = cloud, len(cloud)
     found = {name: value[0] for name, value in jax.device_get(detect(points, count, frustum)).items()}
     for label, score, box in zip(found["label"][: found["count"]], found["score"], found["boxes"]):
-        print(manifest["class_names"][label], score, box)
+        print(manifest["class_names"][label], score, box.round(2))
 
 The manifest gives the shapes, the config and the meaning of every output.
 """
