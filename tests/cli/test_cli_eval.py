@@ -8,14 +8,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 from mini_folders import NAMES, write_custom, write_kitti, write_split
 from small import random_variables, small_config
 
-from ciassd_jax import Config, Detector, save_weights
+from ciassd_jax import Config, Detector, create_train_state, save_weights
 from ciassd_jax.cli import main
+from ciassd_jax.data.loader import LoaderState
 from ciassd_jax.evaluation import evaluate, read_folders, to_json
 from ciassd_jax.formats.kitti_rows import ObjectRow, write_rows
+from ciassd_jax.training.checkpoint import Checkpoints
 
 
 @pytest.fixture
@@ -178,6 +182,34 @@ def test_the_weights_of_a_training_and_the_environments_data(
     shown, _ = capsys.readouterr()
     assert ": difficulty is by the number of points in an object's box," in shown
     assert json.loads(out.read_text())["Car"]["3d"]["R40"]["0.70"] is not None
+
+
+def test_all_checkpoints_are_one_table(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = small_config()
+    state = create_train_state(jax.random.key(0), config, variables=random_variables(config))
+    loader = LoaderState(batch=0, seed=0, batch_size=1, frames=2, checksum=0)
+    with Checkpoints(work / "run/checkpoints", config) as checkpoints:
+        for step in (4, 12):
+            checkpoints.save(state._replace(step=np.int32(step)), loader)
+    arguments = ["eval", "--workdir", str(work / "run"), "--data", str(work / "kitti"), "--all"]
+    assert main([*arguments, "--json", str(work / "all.json")]) == 0
+    title, head, *rows, done = capsys.readouterr().out.splitlines()
+    assert title == "AP in percent, moderate, R40; the score is the mean in 3D"
+    assert head.split() == ["step", "score", "Car", "3D", "0.70", "Car", "BEV", "0.70"]
+    assert [row.split()[0] for row in rows] == ["4", "12"]
+    assert done == f"Wrote {work}/all.json."
+    written = json.loads((work / "all.json").read_text())
+    assert written["4"] == written["12"]
+    assert "Car_bev_0.50_moderate_R40" in written["4"]
+
+
+def test_all_is_of_a_training_and_writes_no_detections(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = ["--data", str(work / "kitti"), "--all"]
+    for others in (["--weights", "car_lite"], ["--workdir", str(work / "run"), "--out", str(work / "out")]):
+        assert main(["eval", *data, *others]) == 2
+        assert "--all prints one table for the checkpoints of --workdir" in capsys.readouterr().err
+    assert main(["eval", *data, "--workdir", str(work / "run")]) == 2
+    assert "has no checkpoint" in capsys.readouterr().err
 
 
 def test_dtype_overrides_that_of_the_weights(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,9 @@ import json
 import logging
 import os
 import re
+import shlex
 import shutil
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +22,8 @@ from small import random_variables
 
 from ciassd_jax import create_train_state, load_weights, make_batches, open_dataset, save_weights
 from ciassd_jax.cli import main
+from ciassd_jax.cli.eval import Evaluate
+from ciassd_jax.cli.options import Frames
 from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.data.gt_sampling import database_path, find_database
 from ciassd_jax.training.checkpoint import Checkpoints
@@ -57,6 +61,7 @@ def test_trains_and_resumes(run: Callable[..., Run], root: Path, tmp_path: Path)
     assert f"from 3 frames into {tmp_path}" in first.out
     assert not database_path(root, "train").exists()
     assert f"Trained 9 steps. Weights, metrics and evaluations are in {tmp_path}." in first.out
+    assert first.out.endswith(f"Next: `ciassd plot {tmp_path}`\n")
     assert steps_of(tmp_path) == [2, 4, 6, 8, 9]
     saved = load_weights(tmp_path / "last.safetensors").variables
     again = run(workdir=tmp_path, **{"log-every": 2})
@@ -116,6 +121,37 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
 
     monkeypatch.setattr("ciassd_jax.cli.train.fit", stand_in)
     return calls
+
+
+def test_says_what_to_run_next(
+    run: Callable[..., Run],
+    fits: list[tuple[Any, ...]],
+    streets: list[tuple[int, int]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    workdir = tmp_path / "my run"
+    done = run(workdir=workdir, data="simulated", frames=8, seed=5, validate="all", **{"evaluate-every": 1})
+    *_, line = done.out.splitlines()
+    evaluation, plot = re.fullmatch("Next: `(.*)`, `(.*)`", line).groups()  # type: ignore[union-attr]
+    assert plot == f"ciassd plot '{workdir}'"
+    parsed: list[Evaluate] = []
+    monkeypatch.setattr(Evaluate, "run", lambda command: parsed.append(command) or 0)
+    assert main(shlex.split(evaluation)[1:]) == 0
+    assert parsed == [Evaluate(Frames("simulated", frames=8), workdir=workdir, split="all", seed=5)]
+
+
+@pytest.mark.parametrize("step", [0, 7])
+def test_a_stopped_training_says_how_to_go_on(
+    step: int, run: Callable[..., Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = create_train_state(jax.random.key(0), mini_config(), variables=random_variables(mini_config()))
+    stopped = Fitted(state._replace(step=np.int32(step)), None, signal.SIGTERM)
+    monkeypatch.setattr("ciassd_jax.cli.train.fit", lambda *arguments, **options: stopped)
+    done = run(workdir=tmp_path)
+    assert done.code == 143
+    curves = f"; `ciassd plot {tmp_path}` draws the curves so far" if step else ""
+    assert done.out.endswith(f"Run the same command again to resume{curves}.\n")
 
 
 def test_starts_from_weights(run: Callable[..., Run], fits: list[tuple[Any, ...]], tmp_path: Path) -> None:
