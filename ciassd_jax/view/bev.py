@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,21 +52,20 @@ def plot_bev(
     boxes, truth = (np.zeros((0, 7)) if some is None else np.asarray(some, np.float64) for some in (boxes, truth))
     chosen, box_notes = choose_boxes(boxes, "detected boxes")
     chosen_truth, truth_notes = choose_boxes(truth, "true boxes")
-    captions = captions_of(len(boxes), scores, labels)
-    true_captions = captions_of(len(truth), None, truth_labels)
-    targets = np.ones(len(truth), bool) if is_target is None else is_target
-    boxes, truth, targets = boxes[chosen], truth[chosen_truth], targets[chosen_truth]
+    captions = np.array(captions_of(len(boxes), scores, labels), object)[chosen]
+    names = np.array(captions_of(len(truth), None, truth_labels), object)[chosen_truth]
+    targets = (np.ones(len(truth), bool) if is_target is None else is_target)[chosen_truth]
+    boxes, truth = boxes[chosen], truth[chosen_truth]
     x_limits = x_limits or _span(visible, boxes, truth, 0)
     y_limits = y_limits or _span(visible, boxes, truth, 1)
     figure = new_picture(figsize=_figure_size(x_limits, y_limits), dpi=150, layout="constrained")
     axes = figure.add_subplot()
     _draw_points(axes, visible)
-    _draw_boxes(axes, truth[~targets], DIMMED, zorder=3, width=0.9)
-    _draw_boxes(axes, truth[targets], TRUTH, zorder=3)
+    for some, color, text_color, width in ((~targets, DIMMED, "#a87573", 0.9), (targets, TRUTH, "#a31515", 1.6)):
+        _draw_boxes(axes, truth[some], color, zorder=3, width=width)
+        _write_captions(axes, truth[some], names[some], text_color, beside=True)
     _draw_boxes(axes, boxes, FOUND, zorder=4)
-    names = [true_captions[index] for index in chosen_truth]
-    _write_captions(axes, truth, names, np.where(targets, "#a31515", "#a87573").tolist(), beside=True)
-    _write_captions(axes, boxes, [captions[index] for index in chosen], ["#0a6b22"] * len(boxes), beside=False)
+    _write_captions(axes, boxes, captions, "#0a6b22", beside=False)
     _dress(axes, x_limits, y_limits)
     _legend(axes, len(boxes), int(targets.sum()), int((~targets).sum()))
     axes.set_title(title or "", loc="left")
@@ -120,7 +119,7 @@ def _draw_boxes(axes: Axes, boxes: Float[np.ndarray, "D 7"], color: str, zorder:
 
 
 def _write_captions(
-    axes: Axes, boxes: Float[np.ndarray, "D 7"], texts: Sequence[str], colors: Sequence[str], *, beside: bool
+    axes: Axes, boxes: Float[np.ndarray, "D 7"], texts: Iterable[str], color: str, *, beside: bool
 ) -> None:
     """A caption above each box, or smaller and beside it."""
     from matplotlib.patheffects import withStroke
@@ -129,7 +128,7 @@ def _write_captions(
     if beside:
         style = {"ha": "left", "va": "center", "fontsize": 6, "xytext": (3, 0)}
     style |= {"path_effects": [withStroke(linewidth=2, foreground="white")], "annotation_clip": True, "zorder": 5}
-    for outline, text, color in zip(_footprints(boxes), texts, colors, strict=True):
+    for outline, text in zip(_footprints(boxes), texts, strict=True):
         (left, low), (right, high) = outline.min(0), outline.max(0)
         at = (right, (low + high) / 2) if beside else ((left + right) / 2, high)
         if text:

@@ -77,7 +77,7 @@ def test_truth_that_is_no_target_is_dimmed_and_the_legend_says_so() -> None:
         np.testing.assert_allclose(heading[0], [x, y], atol=1e-6)
         np.testing.assert_allclose(outline[:4].mean(0), [x, y], atol=1e-6)
     assert legend_of(figure) == ["sensor", "ground truth (1)", "truth that is no target (1)", "detected (0)"]
-    assert (texts_of(figure), figure.axes[0].get_title("left")) == (["Car", "Tram"], "a")
+    assert (texts_of(figure), figure.axes[0].get_title("left")) == (["Tram", "Car"], "a")
 
 
 def test_what_a_score_means_is_said_once_where_there_are_scores() -> None:
