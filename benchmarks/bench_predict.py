@@ -12,7 +12,7 @@ import argparse
 import statistics
 import subprocess
 import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -21,22 +21,16 @@ from real_frames import SHARED
 
 import ciassd_jax
 from ciassd_jax.config.presets import PRESETS
-from ciassd_jax.formats import kitti
-from ciassd_jax.formats.points import read_points
-from ciassd_jax.ops.camera import frustum_planes
+from ciassd_jax.data.clouds import find_clouds, read_cloud
+from ciassd_jax.formats.kitti_camera import frustum_of
+from ciassd_jax.inference.timing import timed
 
 
 def load_frames(shared: Path, number: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return points and frustum of evenly spaced real frames."""
-    clouds = sorted((shared / "kitti/training/velodyne_reduced").glob("*.bin"))
-    frames = []
-    for cloud in clouds[:: max(1, len(clouds) // number)][:number]:
-        calibration = kitti.read_calibration(shared / "kitti/training/calib" / f"{cloud.stem}.txt")
-        width, height = kitti.image_size_for(calibration) or (1242, 375)
-        frames.append(
-            (read_points(cloud), frustum_planes(kitti.lidar_to_image(calibration), width=width, height=height))
-        )
-    return frames
+    clouds = find_clouds(shared / "kitti/training/velodyne_reduced")
+    chosen = clouds[:: max(1, len(clouds) // number)][:number]
+    return [(read_cloud(cloud)[0], frustum_of(cloud.camera)) for cloud in chosen]
 
 
 def our_detector(shared: Path, preset: str | None) -> ciassd_jax.Detector:
@@ -73,13 +67,6 @@ def peak_memory(kind: str, arguments: argparse.Namespace) -> float:
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 
 
-def timed(function, *inputs, **options) -> float:
-    """Return the seconds of one call."""
-    start = time.perf_counter()
-    function(*inputs, **options)
-    return time.perf_counter() - start
-
-
 def main() -> None:
     """Time both detectors alternately and print one line for each."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -103,7 +90,7 @@ def main() -> None:
         for points, planes in frames:
             for name, detector in detectors.items():
                 options = {"frustum": planes} if name == "ours" else {}
-                seconds[name].append(timed(detector, points, **options))
+                seconds[name].append(timed(partial(detector, points, **options))[0])
     for name, values in seconds.items():
         print(
             f"{name}: {1e3 * statistics.median(values):.0f} ms per frame (median; {1e3 * min(values):.0f} to "

@@ -23,7 +23,7 @@ import numpy as np
 from ciassd_jax.config.presets import tiny
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.data.loader import Rows, Stream, host_batches
-from ciassd_jax.inference.machine import describe_machine, free_memory
+from ciassd_jax.inference.machine import describe_machine, free_memory, total_memory
 from ciassd_jax.inference.programs import compile_program, keep_programs
 from ciassd_jax.model.network import RawPredictions, predict_raw, variable_shapes
 from ciassd_jax.types import Boxes, PointCloud, Variables
@@ -58,9 +58,10 @@ class Finding(NamedTuple):
 
 
 class Check(NamedTuple):
-    """A check, and what to do if it raises."""
+    """A check; if it raises, what is wrong then, and what to do."""
 
     find: Callable[[], Iterator[Finding]]
+    broken: str
     remedy: str
 
 
@@ -89,8 +90,8 @@ def _findings(check: Check) -> list[Finding]:
     try:
         return list(check.find())
     except Exception as error:
-        reason = str(error).partition("\n")[0].rstrip(".")
-        return [Finding("FAIL", f"{type(error).__name__}: {reason}; {check.remedy}.")]
+        reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
+        return [Finding("FAIL", f"{check.broken} ({reason}); {check.remedy}.")]
 
 
 def _versions() -> Iterator[Finding]:
@@ -127,17 +128,17 @@ def _devices() -> Iterator[Finding]:
     yield Finding(
         "ok", f"{machine['platform']}: {len(kinds)} x {kinds[0]}; {machine['processor']}, {machine['cores']} cores"
     )
+    for device in jax.local_devices():
+        if stats := device.memory_stats():
+            yield Finding("ok", f"{device.device_kind} has {_gb(stats['bytes_limit'])} of memory for JAX")
     if machine["platform"] == "cpu" and Path("/dev/nvidia0").exists():
         remedy = "pip install 'ciassd_jax[cuda]', and unset JAX_PLATFORMS"
         yield Finding("note", f"This machine has an NVIDIA GPU, and JAX does not use it; {remedy}.")
 
 
 def _memory() -> Iterator[Finding]:
-    total, free = describe_machine()["memory"], free_memory()
+    total, free = total_memory(), free_memory()
     sizes = [f"{_gb(size)} {what}" for size, what in ((free, "free"), (total, "in all")) if size is not None]
-    for device in jax.local_devices():
-        if stats := device.memory_stats():
-            sizes.append(f"{_gb(stats['bytes_limit'])} on {device.device_kind}")
     yield Finding("ok", ", ".join(sizes) or "this system does not tell")
     if free is not None and free < _ENOUGH:
         yield Finding("FAIL", f"Detection needs {_gb(_ENOUGH)}; close other programs.")
@@ -234,7 +235,7 @@ def _forward() -> Iterator[Finding]:
     voxels, means = forward()
     worst = float(np.max([abs(means[name] / mean - 1) for name, mean in _MEANS.items()]))
     if voxels != _VOXELS or not worst <= _TOLERANCE:
-        raise ValueError(f"{voxels} voxels instead of {_VOXELS}, outputs {worst:.1e} off")
+        raise ValueError(f"{voxels} voxels instead of {_VOXELS}, and outputs that are off by {worst:.1e}")
     seconds = time.perf_counter() - start
     yield Finding("ok", f"a tiny network gives the stored result to {worst:.0e}; {seconds:.1f} s with compilation")
 
@@ -261,12 +262,22 @@ def _gb(size: float) -> str:
 
 
 CHECKS = {
-    "versions": Check(_versions, "install the package again: pip install -U --force-reinstall ciassd_jax"),
-    "devices": Check(_devices, "set JAX_PLATFORMS=cpu, or install the driver and pip install 'ciassd_jax[cuda]'"),
-    "memory": Check(_memory, "set JAX_PLATFORMS=cpu"),
-    "disk": Check(_disk, "run in a folder that exists"),
-    "cache": Check(_cache, "set JAX_COMPILATION_CACHE_DIR to a folder that can be written"),
-    "workers": Check(_worker, "train with --workers 0, which reads in a thread"),
-    "forward": Check(_forward, "install other versions of jax and jaxlib, or set JAX_PLATFORMS=cpu"),
-    "extras": Check(_extras, "install the package again"),
+    "versions": Check(_versions, "A package is missing", "pip install -U --force-reinstall ciassd_jax"),
+    "devices": Check(
+        _devices,
+        "JAX finds no device",
+        "set JAX_PLATFORMS=cpu, or install the driver and pip install 'ciassd_jax[cuda]'",
+    ),
+    "memory": Check(_memory, "The memory cannot be read", "compare with what your system says"),
+    "disk": Check(_disk, "The disk cannot be read", "run in a folder that exists"),
+    "cache": Check(
+        _cache, "Compiled programs cannot be kept", "set JAX_COMPILATION_CACHE_DIR to a folder that can be written"
+    ),
+    "workers": Check(_worker, "No worker process answers", "train with --workers 0, which reads in a thread"),
+    "forward": Check(
+        _forward,
+        "A tiny network does not give the stored result",
+        "install other versions of jax and jaxlib, or set JAX_PLATFORMS=cpu",
+    ),
+    "extras": Check(_extras, "The extras cannot be read", "pip install -U --force-reinstall ciassd_jax"),
 }

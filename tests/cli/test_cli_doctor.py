@@ -16,7 +16,7 @@ def finding(state: Any, text: str) -> Check:
     def find() -> Iterator[Finding]:
         yield Finding(state, text)
 
-    return Check(find, "start again")
+    return Check(find, "Broken", "start again")
 
 
 def texts(check: str, state: str) -> list[str]:
@@ -59,12 +59,16 @@ def test_a_failure_and_an_exception_fail(run: Any, monkeypatch: pytest.MonkeyPat
         raise OSError("no device.\nmore")
         yield
 
-    checks = {"disk": finding("FAIL", "full"), "memory": finding("ok", "much"), "devices": Check(broken, "add one")}
+    checks = {
+        "disk": finding("FAIL", "full"),
+        "memory": finding("ok", "much"),
+        "devices": Check(broken, "None found", "add one"),
+    }
     monkeypatch.setattr(doctor, "CHECKS", checks)
     result = run("doctor")
     assert result.code == 1
     assert result.out.splitlines()[-2:] == [
-        "FAIL  devices   OSError: no device; add one.",
+        "FAIL  devices   None found (no device); add one.",
         "Not ready; failed: disk, devices.",
     ]
 
@@ -118,7 +122,7 @@ def test_another_result_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         monkeypatch.setattr(doctor, "forward", lambda: (voxels, means | {"iou": means["iou"] * factor}))  # noqa: B023
         (text,) = texts("forward", "FAIL")
-        assert f"{voxels} voxels instead of {doctor._VOXELS}, outputs {off}" in text
+        assert f"{voxels} voxels instead of {doctor._VOXELS}, and outputs that are off by {off}" in text
 
 
 def test_missing_extras_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
