@@ -178,9 +178,10 @@ def _shapes(num_points: int, batch: int) -> tuple[jax.ShapeDtypeStruct, ...]:
 
 
 def _golden(call: Callable[..., Any], config: Config, num_points: int, batch: int) -> Golden:
-    """Run the program on streets, up to one with boxes that another device finds too.
+    """Run the program on simulated streets; keep the first with boxes that no threshold decides on.
 
-    There, boxes hang on no threshold: they stay within the tolerance when the intensities change.
+    Another device finds these boxes too: they stay within the tolerance when the intensities change a little. If no
+    street has such boxes, as without training, keep the last.
     """
     tolerance = _TOLERANCE[config.dtype]
     for index in range(_STREETS):
