@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,24 @@ def compile_program(function: Any, *arguments: Any, what: str, signals: Sequence
     keep_programs()
     tqdm.write(f"Compiling {what}, once.", file=sys.stderr)
     sys.stderr.flush()
-    return _in_thread(function.lower(*arguments, **named).compile, signals)
+    with _no_collection():
+        lowered = function.lower(*arguments, **named)
+    return _in_thread(lowered.compile, signals)
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Switch the garbage collector off: it would take a quarter of the time of tracing, which leaves no garbage.
+
+    It would also lose a Ctrl-C, as Python ignores an exception in JAX's callback of the collector.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _in_thread(work: Callable[[], Any], signals: Sequence[int]) -> Any:
