@@ -18,7 +18,7 @@ from jax import lax
 from ciassd_jax.config import Config
 from ciassd_jax.model.anchors import make_anchors
 from ciassd_jax.model.frozen import check_frozen, keep_frozen, running_statistics, stop_gradients
-from ciassd_jax.model.network import CIASSD, init_variables, voxelize_batch
+from ciassd_jax.model.network import CIASSD, fitting_variables, init_variables, voxelize_batch
 from ciassd_jax.training.losses import detection_loss
 from ciassd_jax.training.optimizer import learning_rate, make_optimizer, momentum
 from ciassd_jax.training.targets import assign_targets
@@ -35,10 +35,11 @@ def create_train_state(
     """Return the state at step 0, with `variables` ({"params", "batch_stats"}), by default random ones from `key`.
 
     `optimizer` is any optax transformation, by default that of `config.schedule`; give `train_step` the same one.
+    Raises ValueError for variables that do not fit the config, and for frozen parts that do not exist.
     """
     if config.schedule.frozen:
         check_frozen(config)
-    start = init_variables(key, config) if variables is None else variables
+    start = init_variables(key, config) if variables is None else fitting_variables(variables, config)
     params = jax.tree.map(jnp.asarray, start["params"])
     # `step` and `skipped` are separate zeros, because a donated state must not hold one buffer twice.
     return TrainState(
@@ -100,8 +101,10 @@ def compute_loss(
 
     For `jax.value_and_grad(compute_loss, has_aux=True)`. Frozen parts (`config.schedule.frozen`) have no gradient, and
     their BatchNorm layers use their running statistics. With `axis_name` BatchNorm pools over that axis; the loss and
-    the rest are those of the scenes of one device.
+    the rest are those of the scenes of one device. Raises ValueError, while it is traced, for arguments that do not
+    fit.
     """
+    fitting_variables({"params": params, "batch_stats": batch_stats}, config)
     frozen = config.schedule.frozen
     if frozen:
         check_frozen(config)

@@ -202,6 +202,24 @@ def test_an_unknown_part_is_named_before_anything_is_compiled(parts, says):
         jax.eval_shape(partial(train_step, config=config), state, batch())
 
 
+def test_misfits_are_named_before_anything_is_compiled(no_type_checks):
+    config, variables = with_frozen(), random_variables(small_config())
+    with pytest.raises(ValueError, match=r"do not fit the config: params/backbone/.* is missing"):
+        create_train_state(jax.random.key(0), config, variables=variables | {"params": {"head": {}}})
+    state = fresh(config)
+    with pytest.raises(ValueError, match=r"points have the shape .* without a batch axis"):
+        jax.eval_shape(partial(train_step, config=config), state, random_scene(config, 0))
+    with pytest.raises(ValueError, match=r"batch_stats/backbone/.* is missing"):
+        jax.eval_shape(partial(compute_loss, config=config), state.params, {}, batch())
+
+
+def test_states_are_made_of_whatever_holds_variables():
+    config = with_frozen()
+    state = fresh(config)
+    again = create_train_state(jax.random.key(1), config, variables=state)
+    chex.assert_trees_all_equal(again.params, state.params)
+
+
 def test_frozen_parts_are_of_training_alone():
     config = with_frozen("backbone")
     assert config.for_inference() == with_frozen().for_inference()
