@@ -237,6 +237,24 @@ def test_the_detector_is_told_the_frame(tmp_path: Path) -> None:
     assert sources == ["Frame a", "Frame b"]
 
 
+def test_batches_change_neither_order_nor_detections(tmp_path: Path) -> None:
+    dataset = open_dataset(write_kitti(tmp_path), "all")
+    detector = Detector(random_variables(small_config()), small_config())
+    tracked: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DroppedWarning)
+        alone = detect_dataset(detector, dataset)
+        batched = detect_dataset(
+            detector, dataset, lambda names: (tracked.append(name) or name for name in names), batch_size=2
+        )
+    assert [frame.name for frame in batched] == tracked == list(NAMES)
+    for one, other in zip(alone, batched, strict=True):
+        assert len(one.lines) > 0
+        assert one.truth.types == other.truth.types
+        np.testing.assert_allclose(other.result.boxes, one.result.boxes, atol=1e-5)
+        np.testing.assert_allclose(other.detections.score, one.detections.score, atol=1e-5)
+
+
 def test_other_warnings_are_left_alone(tmp_path: Path) -> None:
     def find(points: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
         warnings.warn("of another library", stacklevel=1)
