@@ -57,11 +57,11 @@ def mini_fit(root: Path, workdir: Path, log: Callable[[str], object] = lambda te
 def share_training_programs(monkeypatch: pytest.MonkeyPatch, programs: dict[Any, Any] = _PROGRAMS) -> None:
     """Compile the step of a config once for all trainings that share `programs`."""
 
-    def compile_once(self: Any, batch: Any) -> Any:
+    def compile_once(self: Any, batch: Any, signals: Any) -> Any:
         # The step does not depend on how the data is made.
         key = replace(self.config, data=DataConfig()), batch.frame.sharding, len(batch.frame)
         if key not in programs:
-            programs[key] = _compile(self, batch)
+            programs[key] = _compile(self, batch, signals)
         return programs[key]
 
     monkeypatch.setattr(loop._Run, "_compile", compile_once)

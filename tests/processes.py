@@ -2,7 +2,7 @@
 
 `python tests/processes.py update OUT [COORDINATOR COUNT INDEX]` makes one update of the small network in float64 and
 writes gradients, parameters and metrics to OUT. `train STOP ARGUMENTS` runs `ciassd train` with the small network in
-place of `tiny`, and sends itself SIGTERM in step STOP (0: never).
+place of `tiny`, and sends itself SIGTERM before the step STOP (0: never).
 """
 
 import os

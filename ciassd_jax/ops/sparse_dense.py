@@ -6,6 +6,7 @@ The oracle of `sites.py` and `sparse.py`, and a backend for small grids.
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Float, Int
 
@@ -26,7 +27,7 @@ def strided_sites(
     """Return the sites of a strided convolution, every output whose window holds an active input, and the overflow."""
     mask = to_dense((sites.keys != NO_SITE).astype(jnp.float32)[:, None], sites, shape=shape)[..., 0]
     pads = [(p, p) for p in padding]
-    active = lax.reduce_window(mask, 0.0, lax.max, kernel, stride, pads) > 0
+    active = lax.reduce_window(mask, np.float32(0), lax.max, kernel, stride, pads) > 0
     # Ascending keys: y slowest, then x, then z.
     y, x, z = jnp.nonzero(active.transpose(1, 2, 0), size=capacity, fill_value=-1)
     keys = linear_keys(jnp.stack([z, y, x], -1).astype(jnp.int32), out_shape)

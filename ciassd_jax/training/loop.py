@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -180,9 +180,10 @@ class _Run:
         """
         if self.program is not None:
             return distributed.shard_batch(next(self.batches), self.mesh)
-        with signals.raising() if jax.process_count() == 1 else nullcontext():
+        alone = jax.process_count() == 1
+        with signals.raising() if alone else nullcontext():
             batch = distributed.shard_batch(next(self.batches), self.mesh)
-            self.program = self._compile(batch)
+            self.program = self._compile(batch, signals if alone else ())
         self.progress.start()
         return batch
 
@@ -195,13 +196,13 @@ class _Run:
         elif step % self.intervals.log == 0:
             self._write_line(step)
 
-    def _compile(self, batch: Scene) -> Any:
-        """Compile the step, and log its time and memory."""
+    def _compile(self, batch: Scene, signals: Sequence[int]) -> Any:
+        """Compile the step unless there is a signal, and log its time and memory."""
         start = time.perf_counter()
         step: Any = distributed.shard_step(partial(train_step, config=self.config, optimizer=self.optimizer), self.mesh)
         scenes, points, _ = batch.cloud.points.shape
         what = f"the training step for {scenes} scenes of {points} points"
-        program = compile_program(step, self.state, batch, what=what)
+        program = compile_program(step, self.state, batch, what=what, signals=signals)
         memory: Any = program.memory_analysis()
         sizes = ", ".join(
             f"{name} {size / 1e6:.0f} MB"

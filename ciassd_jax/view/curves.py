@@ -33,8 +33,8 @@ def plot_curves(runs: Mapping[str, Lines]) -> Figure:
     """Return a picture of the lines of metrics.jsonl of runs by name, with one panel per quantity over the steps.
 
     The quantities are the loss and its terms, the learning rate, the positive anchors, and the AP of each class on the
-    validation frames with their mean, the score; those that no run has are left out. A curve has a gap where its number was not finite. Raises
-    ModuleNotFoundError without matplotlib.
+    validation frames with their mean, the score; those that no run has are left out. A curve has a gap where its number
+    was not finite. Raises ModuleNotFoundError without matplotlib.
     """
     panels = {title: {name: ""} for name, title in _TITLES.items()} | _precisions(runs.values())
     panels = {title: names for title, names in panels.items() if any(_has(lines, names) for lines in runs.values())}

@@ -62,10 +62,10 @@ def test_two_processes_stop_together_and_one_resumes(tmp_path: Path) -> None:
     options += ("--log-every", 1, "--evaluate-every", 2)
     together = ("--coordinator", f"localhost:{free_port()}", "--num-processes", 2, "--process-index")
     # Only the second process gets the signal.
-    first, second = run_together(*(("train", 4 * index, *options, *together, index) for index in range(2)))
+    first, second = run_together(*(("train", 5 * index, *options, *together, index) for index in range(2)))
     assert (first[0], second[0]) == (143, 143), (first, second)
     assert "Compiled the step of 2 scenes for 2 cpu devices of 2 processes in " in first[1]
-    assert "Stopped by signal 15 after step 4, which is saved" in first[1]
+    assert "Stopped by SIGTERM after step 4, which is saved" in first[1]
     assert "step" not in second[1]
     assert "Traceback" not in first[2] + second[2]
 

@@ -182,7 +182,7 @@ def test_a_stopped_run_resumes_to_the_same_bits(
 def test_a_signal_ends_the_compilation_at_once(
     number: int, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def compile_long(self: Any, batch: Any) -> None:
+    def compile_long(self: Any, batch: Any, signals: Any) -> None:
         signal.raise_signal(number)
         raise AssertionError("the signal was deferred")
 
