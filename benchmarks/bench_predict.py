@@ -4,6 +4,8 @@ Command: pip install -e '.[peer]' && python benchmarks/bench_predict.py [--frame
 
 Both detectors process the same frames alternately, on the same cores, after one warm-up each. Peak memory is measured
 in a separate process for each. `--preset car_lite` times an untrained network of that preset without the peer.
+
+`--weights car_lite --frames 16 --batch-sizes 1 4 8` times a detector with these weights in batches, without the peer.
 """
 
 from __future__ import annotations
@@ -41,6 +43,24 @@ def our_detector(shared: Path, preset: str | None) -> ciassd_jax.Detector:
     return ciassd_jax.Detector(ciassd_jax.init_variables(jax.random.key(0), config), config)
 
 
+def measure_batches(weights: str, arguments: argparse.Namespace) -> None:
+    """Time passes over all frames in batches of each size, alternately, and print one line for each size."""
+    detector = ciassd_jax.Detector.from_pretrained(weights)
+    clouds, frustums = zip(*load_frames(arguments.shared, arguments.frames), strict=True)
+    seconds: dict[int, list[float]] = {size: [] for size in arguments.batch_sizes}
+    for repeat in range(1 + arguments.repeats):
+        for size, values in seconds.items():
+            taken, _ = timed(partial(detector, clouds, frustum=frustums, batch_size=size))
+            # The first pass compiles.
+            values += [taken / len(clouds)] * (repeat > 0)
+    for size, values in seconds.items():
+        median = statistics.median(values)
+        print(
+            f"batch {size}: {1e3 * median:.0f} ms per frame (median of {len(values)} passes over {len(clouds)} frames; "
+            f"{1e3 * min(values):.0f} to {1e3 * max(values):.0f}), {1 / median:.1f} frames/s"
+        )
+
+
 def peer_detector(shared: Path):
     """Return the detection of the same network in torch + spconv on two threads."""
     import torch
@@ -74,10 +94,15 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--shared", type=Path, default=SHARED)
     parser.add_argument("--preset", choices=sorted(PRESETS))
+    parser.add_argument("--weights", default="car_lite", help="file or name, for --batch-sizes")
+    parser.add_argument("--batch-sizes", type=int, nargs="+")
     parser.add_argument("--alone", choices=("ours", "peer"))
     arguments = parser.parse_args()
     if arguments.alone:
         measure_alone(arguments.alone, arguments)
+        return
+    if arguments.batch_sizes:
+        measure_batches(arguments.weights, arguments)
         return
     frames = load_frames(arguments.shared, arguments.frames)
     detectors = {"ours": our_detector(arguments.shared, arguments.preset)}

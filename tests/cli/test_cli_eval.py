@@ -255,6 +255,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "another config": (lambda w: {"preset": "car"}, r"does not fit the config in .* tensors: .*; leave out --preset"),
     "threshold": (lambda w: {"score-threshold": 1.5}, r"--config\.detection\.score-threshold\): 1\.5 is outside"),
+    "batch size": (lambda w: {"batch-size": -1}, r"--batch-size is -1; detect at least 1 cloud at once"),
     "no data": (lambda w: {"data": w / "none"}, r"none has no folder training or testing \(KITTI\) or points"),
     "no split": (lambda w: {"split": "mine"}, r"ImageSets/mine\.txt does not exist; write it"),
     "absent frames": (lambda w: {"split": "train"}, r"3711 of 3712 frames have no cloud .*; copy them, or list"),
