@@ -39,8 +39,8 @@ class FrameResult:
     `boxes` [N, 7] are x, y, z, length, width, height in metres and yaw in [-pi, pi), in the LiDAR frame, in the order
     of selection. `scores` are rectified: class probability * predicted IoU ** 4, after NMS. `labels` are class names,
     `counts` the numbers of points, voxels, sites and candidates used and dropped, `seconds` the time from points to
-    boxes without compilation. `class_names` are all classes of the detector. An index, a slice or a mask chooses
-    detections: `result[:5]`.
+    boxes without compilation, that of a batch divided by its clouds. `class_names` are all classes of the detector. An
+    index, a slice or a mask chooses detections: `result[:5]`.
     """
 
     boxes: np.ndarray
