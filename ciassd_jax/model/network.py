@@ -73,7 +73,9 @@ def init_variables(key: Array, config: Config) -> Any:
 @cache
 def variable_shapes(config: Config) -> Any:
     """Shapes and types of {"params", "batch_stats"}; nothing is computed."""
-    return jax.eval_shape(lambda: init_variables(jax.random.key(0), config))
+    shapes = jax.eval_shape(lambda: init_variables(jax.random.key(0), config))
+    # Without the mesh of the `shard_map` in which the first call may be traced.
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), shapes)
 
 
 class RawPredictions(NamedTuple):

@@ -10,8 +10,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from jax.sharding import PartitionSpec
 from mini_training import write_data
+from small import small_config
 
+from ciassd_jax.model.network import variable_shapes
 from ciassd_jax.training import distributed
 from ciassd_jax.training.distributed import ParallelError, connect, data_mesh, describe
 
@@ -75,6 +78,19 @@ def test_two_processes_stop_together_and_one_resumes(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == [1, 2, 3, 4, 5, 6]
     assert [line["step"] for line in lines if "score" in line] == [3, 6]
+
+
+def test_shapes_that_a_sharded_step_asks_for_have_no_mesh() -> None:
+    variable_shapes.cache_clear()
+    found = []
+
+    def step(scene: jax.Array) -> jax.Array:
+        found.append(variable_shapes(small_config()))
+        return scene
+
+    rows = PartitionSpec(distributed.AXIS)
+    jax.eval_shape(jax.shard_map(step, mesh=data_mesh(2), in_specs=rows, out_specs=rows), np.zeros(2))
+    assert {leaf.sharding for leaf in jax.tree.leaves(found[0])} == {None}
 
 
 def test_a_single_process_uses_as_many_devices_as_divide_the_batch() -> None:
