@@ -86,7 +86,7 @@ class Train:
     remat: Unset[bool] = None
     """Recompute activations in the backward pass: less memory, more time."""
     log_every: Steps[int] = 50
-    """Steps between two lines of metrics.jsonl."""
+    """Steps between two lines. Their ETA goes by the mean pace since the start, evaluations so far included."""
     save_every: Steps[int] = 1000
     """Steps between two checkpoints."""
     evaluate_every: Epochs[int] = 10
