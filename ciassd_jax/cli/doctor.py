@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -24,7 +24,7 @@ from ciassd_jax.config.presets import tiny
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.data.loader import Rows, Stream, host_batches
 from ciassd_jax.inference.machine import describe_machine, free_memory, total_memory
-from ciassd_jax.inference.programs import compile_program, keep_programs
+from ciassd_jax.inference.programs import compile_program, for_this_backend, keep_programs
 from ciassd_jax.model.network import RawPredictions, predict_raw, variable_shapes
 from ciassd_jax.types import Boxes, PointCloud, Variables
 
@@ -220,9 +220,7 @@ def _weights() -> Variables:
 
 def forward() -> tuple[int, dict[str, float]]:
     """Run the network of `tiny()`; return the occupied voxels and the mean absolute value of each output."""
-    config = tiny().for_inference()
-    if jax.default_backend() == "cpu":
-        config = replace(config, program="cpu")
+    config = for_this_backend(tiny().for_inference())
     cloud = PointCloud(_points()[None], np.array([len(_points())], np.int32))
     program = compile_program(jax.jit(partial(predict_raw, config=config)), _weights(), cloud, what="a tiny network")
     raw: RawPredictions = jax.device_get(program(_weights(), cloud))

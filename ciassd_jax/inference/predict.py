@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache, partial
 
 import jax
@@ -11,7 +10,7 @@ from jaxtyping import Float
 
 from ciassd_jax.config import Config
 from ciassd_jax.inference.postprocess import postprocess
-from ciassd_jax.inference.programs import compile_program
+from ciassd_jax.inference.programs import compile_program, for_this_backend
 from ciassd_jax.model.checks import check_cloud
 from ciassd_jax.model.network import predict_raw, variable_shapes
 from ciassd_jax.ops.camera import ANYWHERE
@@ -44,13 +43,10 @@ def compile_predict(config: Config, num_points: int, batch: int = 1) -> jax.stag
     Programs are kept and shared by all callers of an equal config; pass `config.for_inference()`.
     """
     variables = variable_shapes(config)
-    if config.program == "auto" and jax.default_backend() == "cpu":
-        # Half the time of tracing goes to the form that only accelerators use.
-        config = replace(config, program="cpu")
     cloud = PointCloud(np.zeros((batch, num_points, 4), np.float32), np.zeros(batch, np.int32))
     scenes = "1 scene" if batch == 1 else f"{batch} scenes"
     return compile_program(
-        jax.jit(partial(predict, config=config)),
+        jax.jit(partial(predict, config=for_this_backend(config))),
         variables,
         cloud,
         frustum=np.broadcast_to(ANYWHERE, (batch, *ANYWHERE.shape)),

@@ -9,10 +9,13 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
+
+from ciassd_jax.config import Config
 
 # The compiler runs in a thread; the default stack of one is too small for it on some systems.
 _STACK = 2**26
@@ -41,14 +44,28 @@ def compile_program(function: Any, *arguments: Any, what: str, signals: Sequence
     Ctrl-C ends the wait at once, though the compiler does not stop: it raises KeyboardInterrupt. So does an entry that
     a signal handler appends to `signals`.
     """
-    from tqdm.auto import tqdm
-
     keep_programs()
-    tqdm.write(f"Compiling {what}, once.", file=sys.stderr)
-    sys.stderr.flush()
+    announce(what)
     with _no_collection():
         lowered = function.lower(*arguments, **named)
     return _in_thread(lowered.compile, signals)
+
+
+def announce(what: str) -> None:
+    """Say on stderr that `what` is being compiled."""
+    from tqdm.auto import tqdm
+
+    tqdm.write(f"Compiling {what}, once.", file=sys.stderr)
+    sys.stderr.flush()
+
+
+def for_this_backend(config: Config) -> Config:
+    """Return the config with the form of the program that this machine runs.
+
+    On a CPU half the time of tracing would go to the form that only accelerators use.
+    """
+    on_cpu = config.program == "auto" and jax.default_backend() == "cpu"
+    return replace(config, program="cpu") if on_cpu else config
 
 
 @contextmanager

@@ -24,7 +24,8 @@ from ciassd_jax.data.loader import Batches
 from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import InputError, Pathlike
 from ciassd_jax.formats.writing import check_folder
-from ciassd_jax.inference.programs import compile_program
+from ciassd_jax.inference.cost import program_memory
+from ciassd_jax.inference.programs import announce, compile_program, for_this_backend
 from ciassd_jax.inference.scoring import TRAINED
 from ciassd_jax.inference.weights import save_weights
 from ciassd_jax.model.checks import variables_of
@@ -182,6 +183,7 @@ class _Run:
             return distributed.shard_batch(next(self.batches), self.mesh)
         alone = jax.process_count() == 1
         with signals.raising() if alone else nullcontext():
+            announce("the augmentation of scenes")
             batch = distributed.shard_batch(next(self.batches), self.mesh)
             self.program = self._compile(batch, signals if alone else ())
         self.progress.start()
@@ -199,17 +201,12 @@ class _Run:
     def _compile(self, batch: Scene, signals: Sequence[int]) -> Any:
         """Compile the step unless there is a signal, and log its time and memory."""
         start = time.perf_counter()
-        step: Any = distributed.shard_step(partial(train_step, config=self.config, optimizer=self.optimizer), self.mesh)
+        function = partial(train_step, config=for_this_backend(self.config), optimizer=self.optimizer)
+        step: Any = distributed.shard_step(function, self.mesh)
         scenes, points, _ = batch.cloud.points.shape
         what = f"the training step for {scenes} scenes of {points} points"
         program = compile_program(step, self.state, batch, what=what, signals=signals)
-        memory: Any = program.memory_analysis()
-        sizes = ", ".join(
-            f"{name} {size / 1e6:.0f} MB"
-            for name in ("argument", "output", "temp")
-            # Some backends do not report memory.
-            if (size := getattr(memory, f"{name}_size_in_bytes", None)) is not None
-        )
+        sizes = ", ".join(f"{name} {size / 1e6:.0f} MB" for name, size in program_memory(program).items() if size)
         self._log(
             f"Compiled the step of {scenes} scenes for {distributed.describe(self.mesh)} in "
             f"{time.perf_counter() - start:.1f} s; memory: {sizes or 'unknown'}."
