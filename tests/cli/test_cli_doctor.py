@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import pytest
 
-from ciassd_jax.cli import doctor
-from ciassd_jax.cli.doctor import Check, Finding
+from ciassd_jax.inference import self_checks
+from ciassd_jax.inference.self_checks import Check, Finding
 
 
 def finding(state: Any, text: str) -> Check:
@@ -20,7 +20,7 @@ def finding(state: Any, text: str) -> Check:
 
 
 def texts(check: str, state: str) -> list[str]:
-    return [one.text for one in doctor._findings(doctor.CHECKS[check]) if one.state == state]
+    return [one.text for one in self_checks.run_check(self_checks.CHECKS[check]) if one.state == state]
 
 
 @pytest.fixture
@@ -37,14 +37,14 @@ def test_the_doctor_finds_this_machine_ready(run: Any) -> None:
     result = run("doctor")
     assert result.code == 0
     assert result.out.endswith("Ready: every check passed.\n")
-    assert {line.split()[1] for line in result.out.splitlines()[:-1]} == set(doctor.CHECKS)
+    assert {line.split()[1] for line in result.out.splitlines()[:-1]} == set(self_checks.CHECKS)
     assert "stored result" in result.out
     assert "worker process started" in result.out
 
 
 def test_a_note_is_no_failure(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     checks = {"disk": finding("ok", "much"), "extras": finding("note", "Without it nothing; install it.")}
-    monkeypatch.setattr(doctor, "CHECKS", checks)
+    monkeypatch.setattr(self_checks, "CHECKS", checks)
     result = run("doctor")
     assert (result.code, result.err) == (0, "")
     assert result.out.splitlines() == [
@@ -64,7 +64,7 @@ def test_a_failure_and_an_exception_fail(run: Any, monkeypatch: pytest.MonkeyPat
         "memory": finding("ok", "much"),
         "devices": Check(broken, "None found", "add one"),
     }
-    monkeypatch.setattr(doctor, "CHECKS", checks)
+    monkeypatch.setattr(self_checks, "CHECKS", checks)
     result = run("doctor")
     assert result.code == 1
     assert result.out.splitlines()[-2:] == [
@@ -75,9 +75,9 @@ def test_a_failure_and_an_exception_fail(run: Any, monkeypatch: pytest.MonkeyPat
 
 def test_versions_are_compared_with_what_is_needed_and_tested(monkeypatch: pytest.MonkeyPatch) -> None:
     assert texts("versions", "FAIL") == []
-    monkeypatch.setattr(doctor, "version", lambda name: {"jax": "0.9.1", "numpy": "3.0.0rc1"}.get(name, "0.12.8"))
-    monkeypatch.setattr(doctor, "requires", lambda name: ["jax>=0.10", "numpy>=2.0", "x>=1; extra == 'viz'"])
-    monkeypatch.setattr(doctor, "_TESTED", {"jax": ("0.10.2", "0.12.0"), "numpy": ("2.4", "2.5")})
+    monkeypatch.setattr(self_checks, "version", lambda name: {"jax": "0.9.1", "numpy": "3.0.0rc1"}.get(name, "0.12.8"))
+    monkeypatch.setattr(self_checks, "requires", lambda name: ["jax>=0.10", "numpy>=2.0", "x>=1; extra == 'viz'"])
+    monkeypatch.setattr(self_checks, "_TESTED", {"jax": ("0.10.2", "0.12.0"), "numpy": ("2.4", "2.5")})
     (failed,) = texts("versions", "FAIL")
     assert failed == "jax 0.9.1 is older than 0.10, the oldest that works; pip install -U 'jax>=0.10'."
     assert [text.split(" was")[0] for text in texts("versions", "note")] == ["jax 0.9.1", "numpy 3.0.0rc1"]
@@ -85,12 +85,12 @@ def test_versions_are_compared_with_what_is_needed_and_tested(monkeypatch: pytes
 
 @pytest.mark.parametrize(("text", "number"), [("0.12.0.1", (0, 12, 0)), ("2.5", (2, 5)), ("3.13.0rc1+x9", (3, 13, 0))])
 def test_versions_are_numbers(text: str, number: tuple[int, ...]) -> None:
-    assert doctor._number(text) == number
+    assert self_checks._number(text) == number
 
 
 def test_too_little_memory_and_disk_fail(monkeypatch: pytest.MonkeyPatch, cache: Path) -> None:
     assert texts("memory", "FAIL") == texts("disk", "FAIL") == []
-    monkeypatch.setattr(doctor, "_ENOUGH", 1e18)
+    monkeypatch.setattr(self_checks, "_ENOUGH", 1e18)
     assert texts("memory", "FAIL") == ["Detection needs 1000000000.0 GB; close other programs."]
     assert all(
         text.endswith(f"free some space in {where}.")
@@ -108,21 +108,21 @@ def test_the_cache_is_created_and_measured(cache: Path) -> None:
 
 
 def test_another_result_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    means = dict(doctor._MEANS)
-    monkeypatch.setattr(doctor, "forward", lambda: (doctor._VOXELS, means))
+    means = dict(self_checks._MEANS)
+    monkeypatch.setattr(self_checks, "forward", lambda: (self_checks._VOXELS, means))
     assert len(texts("forward", "ok")) == 1
     for voxels, factor, off in (
-        (doctor._VOXELS, 1.01, "1.0e-02"),
-        (doctor._VOXELS, float("nan"), "nan"),
+        (self_checks._VOXELS, 1.01, "1.0e-02"),
+        (self_checks._VOXELS, float("nan"), "nan"),
         (1, 1.0, "0"),
     ):
-        monkeypatch.setattr(doctor, "forward", lambda: (voxels, means | {"iou": means["iou"] * factor}))  # noqa: B023
+        monkeypatch.setattr(self_checks, "forward", lambda: (voxels, means | {"iou": means["iou"] * factor}))  # noqa: B023
         (text,) = texts("forward", "FAIL")
-        assert f"{voxels} voxels instead of {doctor._VOXELS}, and outputs that are off by {off}" in text
+        assert f"{voxels} voxels instead of {self_checks._VOXELS}, and outputs that are off by {off}" in text
 
 
 def test_missing_extras_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_installed", lambda name: name != "plotly")
+    monkeypatch.setattr(self_checks, "_installed", lambda name: name != "plotly")
     assert texts("extras", "note") == [
         "Without plotly there are no pictures and 3D pages; pip install 'ciassd_jax[viz]'."
     ]
