@@ -5,8 +5,8 @@ Exit codes: 0 success, 1 failed check, 2 bad usage or input (one sentence on std
 
 from __future__ import annotations
 
+import errno
 import gc
-import os
 import platform
 import sys
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from ciassd_jax.cli.doctor import Doctor
 from ciassd_jax.cli.eval import Evaluate
 from ciassd_jax.cli.export import Export
 from ciassd_jax.cli.info import Info
-from ciassd_jax.cli.messages import UsageError, describe, option_of, silenced
+from ciassd_jax.cli.messages import UsageError, describe, discard, option_of, silenced
 from ciassd_jax.cli.names import check_names
 from ciassd_jax.cli.plot import Plot
 from ciassd_jax.cli.predict import Predict
@@ -84,19 +84,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str]) -> int:
     try:
         check_names(arguments, Command)
-        if "--version" in arguments:
-            print(f"ciassd_jax {version('ciassd_jax')}, JAX {version('jax')}, Python {platform.python_version()}")
-            return 0
-        code = _parse(arguments).run()
-        sys.stdout.flush()
+        code = _print_versions() if "--version" in arguments else _parse(arguments).run()
+        print(end="", flush=True)
         return code
     except (InputError, UsageError) as error:
         print(f"error: {describe(error)}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        # The reader of the output, such as `head`, has closed it.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard(sys.stdout)
         return 0
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        discard(sys.stdout)
+        print("error: A disk that is written to is full; free some space and run again.", file=sys.stderr)
+        return 2
+
+
+def _print_versions() -> int:
+    print(f"ciassd_jax {version('ciassd_jax')}, JAX {version('jax')}, Python {platform.python_version()}")
+    return 0
 
 
 def _parse(arguments: Sequence[str]) -> Command:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import re
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TextIO, TypeVar, get_args, get_type_hints
 
 from ciassd_jax.config import Config
 from ciassd_jax.formats.errors import DroppedWarning, FormatWarning
@@ -71,6 +72,22 @@ def option_of(field: str) -> str:
     return "--config." + re.sub(r"\[(\d+)\]", r".\1", field).replace("_", "-")
 
 
+def tell(text: str, stream: TextIO | None = None) -> None:
+    """Print a line at once and above any progress bar, by default on stdout; work goes on if nobody reads it."""
+    from tqdm.auto import tqdm
+
+    try:
+        tqdm.write(text, file=stream)
+        print(end="", file=stream, flush=True)
+    except BrokenPipeError:
+        discard(stream or sys.stdout)
+
+
+def discard(stream: TextIO) -> None:
+    """Write to nowhere from now on: the reader of the stream, such as `head`, or `tee` after Ctrl-C, has closed it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 @contextmanager
 def silenced(*loggers: str) -> Iterator[None]:
     """Keep libraries from logging pages of traces where the package reports the failure in one sentence."""
@@ -90,8 +107,6 @@ def warnings_as_lines(source: Path | str) -> Iterator[None]:
 
     Of warnings that differ only in file and numbers, the first is printed and the others are counted at the end.
     """
-    from tqdm.auto import tqdm
-
     kinds: dict[str, list[str]] = {}
 
     def show(message, category, *rest, **more):  # type: ignore[no-untyped-def]
@@ -103,7 +118,7 @@ def warnings_as_lines(source: Path | str) -> Iterator[None]:
         alike = kinds.setdefault(message.kind, [])
         alike.append(text)
         if len(alike) == 1:
-            tqdm.write(f"warning: {text}", file=sys.stderr)
+            tell(f"warning: {text}", sys.stderr)
 
     before = warnings.showwarning
     with warnings.catch_warnings():
@@ -115,7 +130,8 @@ def warnings_as_lines(source: Path | str) -> Iterator[None]:
         finally:
             for first, *others in kinds.values():
                 if others and set(others) != {first}:
-                    tqdm.write(f"warning: {len(others)} more warnings like this: {first}", file=sys.stderr)
+                    more = "1 more warning" if len(others) == 1 else f"{len(others)} more warnings"
+                    tell(f"warning: {more} like this: {first}", sys.stderr)
 
 
 def frames_with_bar(items: Sequence[Item]) -> Iterable[Item]:

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
-from ciassd_jax.cli.messages import UsageError, describe, warnings_as_lines
+from ciassd_jax.cli.messages import UsageError, describe, tell, warnings_as_lines
 from ciassd_jax.cli.options import (
     BatchSize,
     Columns,
@@ -141,7 +141,7 @@ class Predict:
                 frames += [frame] * (self.html and len(frames) < _FRAMES_OF_PAGE)
                 if self.path.is_dir():
                     best = f"best {result.scores.max():.2f}" if len(result) else "none"
-                    bar.write(f"{cloud.file.cloud.name}: {len(result)} boxes, {best}, {result.seconds:.3f} s")
+                    tell(f"{cloud.file.cloud.name}: {len(result)} boxes, {best}, {result.seconds:.3f} s")
         if frames:
             written.append(view_html(frames, title="ciassd predict").save(self.out / "view.html"))
         if self.path.is_dir():

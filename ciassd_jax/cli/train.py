@@ -14,7 +14,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.initial_weights import describe_taken, find_unloaded
-from ciassd_jax.cli.messages import UsageError, frames_with_bar, values_from_options, warnings_as_lines
+from ciassd_jax.cli.messages import UsageError, frames_with_bar, tell, values_from_options, warnings_as_lines
 from ciassd_jax.cli.options import Dtype, Epochs, Folder, Frames, Split, Steps, Unset, WeightsFile
 from ciassd_jax.config import Config, ScheduleConfig
 from ciassd_jax.data.frames import Dataset
@@ -101,14 +101,12 @@ class Train:
     """Index of this process, from 0."""
 
     def run(self) -> int:
-        from tqdm.auto import tqdm
-
         folder = self.data_set.find_folder()
         check_folder(self.workdir)
         with warnings_as_lines(folder or "simulated frames"):
             try:
                 connect(self.coordinator, self.num_processes, self.process_index)
-                return self._train(folder, tqdm.write if is_process_0() else lambda text: None)
+                return self._train(folder, tell if is_process_0() else lambda text: None)
             except (WorkerError, TrainingError, ParallelError) as error:
                 raise UsageError(str(error)) from error
 

@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,8 +55,10 @@ def announce(what: str) -> None:
     """Say on stderr that `what` is being compiled."""
     from tqdm.auto import tqdm
 
-    tqdm.write(f"Compiling {what}, once.", file=sys.stderr)
-    sys.stderr.flush()
+    # A reader that has gone, such as `tee` after Ctrl-C, is no reason to end.
+    with suppress(BrokenPipeError):
+        tqdm.write(f"Compiling {what}, once.", file=sys.stderr)
+        sys.stderr.flush()
 
 
 def for_this_backend(config: Config) -> Config:

@@ -1,5 +1,6 @@
 """The program `ciassd`: its commands, their help, and the answers to wrong and to old options."""
 
+import os
 import re
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import pytest
 
 from ciassd_jax.cli import Command, main
 from ciassd_jax.cli.config_options import Preset
+from ciassd_jax.cli.messages import tell
 from ciassd_jax.cli.names import _ANSWERS, options_of, subcommands
 from ciassd_jax.config.presets import PRESETS
 
@@ -142,3 +144,22 @@ def test_simulated_frames_that_do_not_exist_are_one_sentence(
     assert (result.code, result.out) == (2, "")
     assert words in result.err
     assert result.err.count("\n") == 1
+
+
+def test_work_goes_on_when_nobody_reads_its_lines() -> None:
+    """`ciassd train | tee log`: Ctrl-C ends `tee` first, and the state must still be saved."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w", encoding="utf-8") as stream:
+        tell("This line breaks the pipe.", stream)
+        tell("This one goes nowhere.", stream)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no /dev/full")
+def test_output_to_a_full_disk_is_one_sentence(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert main(["--version"]) == 2
+    assert capsys.readouterr().err == ("error: A disk that is written to is full; free some space and run again.\n")
