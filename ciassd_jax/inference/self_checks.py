@@ -69,8 +69,9 @@ def run_check(check: Check) -> list[Finding]:
     try:
         return list(check.find())
     except Exception as error:
-        reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
-        return [Finding("FAIL", f"{check.broken} ({reason}); {check.remedy}.")]
+        # JAX's assertions have no text.
+        reason = f" ({text})" if (text := str(error).partition("\n")[0].rstrip(".")) else ""
+        return [Finding("FAIL", f"{check.broken}{reason}; {check.remedy}.")]
 
 
 def _versions() -> Iterator[Finding]:
@@ -124,7 +125,8 @@ def _memory() -> Iterator[Finding]:
 
 
 def _disk() -> Iterator[Finding]:
-    for name, folder in (("here", Path.cwd()), ("compilation cache", _cache_folder())):
+    folders = {"here": Path.cwd()} | ({} if (cache := _cache_folder()) is None else {"compilation cache": cache})
+    for name, folder in folders.items():
         existing = next(path for path in (folder, *folder.parents) if path.exists())
         free = shutil.disk_usage(existing).free
         yield Finding("ok", f"{_gb(free)} free {name} ({folder})")
@@ -138,14 +140,18 @@ def _cache() -> Iterator[Finding]:
         yield Finding("note", "Off, so every process compiles anew; unset JAX_ENABLE_COMPILATION_CACHE.")
         return
     folder = _cache_folder()
+    if folder is None:
+        raise ValueError("~/.cache cannot be written")
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         files = [path.stat().st_size for path in folder.iterdir() if path.is_file()]
     yield Finding("ok", f"{folder} is writable and holds {sum(files) / 1e6:.0f} MB in {len(files)} files")
 
 
-def _cache_folder() -> Path:
-    return Path(jax.config.jax_compilation_cache_dir).absolute()  # type: ignore[attr-defined]
+def _cache_folder() -> Path | None:
+    """The folder of the compilation cache; None if `keep_programs` found none that can be written."""
+    folder = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    return None if folder is None else Path(folder).absolute()
 
 
 def _worker() -> Iterator[Finding]:
@@ -208,6 +214,11 @@ def forward() -> tuple[int, dict[str, float]]:
 
 def _forward() -> Iterator[Finding]:
     """Does a forward pass give the stored result?"""
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError):
+        yield Finding("note", "Not run, because there is no device; see devices.")
+        return
     start = time.perf_counter()
     voxels, means = forward()
     worst = float(np.max([abs(means[name] / mean - 1) for name, mean in _MEANS.items()]))

@@ -127,3 +127,21 @@ def test_missing_extras_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
         "Without plotly there are no pictures and 3D pages; pip install 'ciassd_jax[viz]'."
     ]
     assert texts("extras", "ok") == ["tb for TensorBoard events"]
+
+
+def test_without_a_device_the_forward_pass_is_not_blamed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def devices() -> list[Any]:
+        raise RuntimeError("no backend")
+
+    monkeypatch.setattr(jax, "devices", devices)
+    assert texts("forward", "note") == ["Not run, because there is no device; see devices."]
+
+
+def test_without_a_cache_the_disk_is_not_blamed(cache: Path) -> None:
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert texts("disk", "FAIL") == []
+    (text,) = texts("cache", "FAIL")
+    assert text == (
+        "Compiled programs cannot be kept (~/.cache cannot be written); set JAX_COMPILATION_CACHE_DIR to a folder that "
+        "can be written."
+    )
