@@ -1,8 +1,8 @@
 """The training step as pure functions: `compute_loss`, `apply_gradients`, and `train_step`, which consists of both.
 
-They run under `jit`, and with `axis_name` under `pmap` or `shard_map`, where batch statistics, and in `train_step`
-gradients and metrics, are pooled over that axis. Under `jit` alone a batch may be sharded over a mesh too; XLA then
-gathers the features of all scenes on every device.
+They run under `jit`, and with `axis_name` under `pmap` or `shard_map(..., check_vma=False)`, where batch statistics,
+and in `train_step` gradients and metrics, are pooled over that axis. Under `jit` alone a batch may be sharded over a
+mesh of automatic axes (`jax.sharding.AxisType.Auto`) too; XLA then gathers the features of all scenes on every device.
 """
 
 from __future__ import annotations
@@ -34,22 +34,24 @@ def create_train_state(
 ) -> TrainState:
     """Return the state at step 0, with `variables` ({"params", "batch_stats"}), by default random ones from `key`.
 
-    `optimizer` is any optax transformation, by default that of `config.schedule`; give `train_step` the same one.
-    Raises ValueError for variables that do not fit the config, and for frozen parts that do not exist.
+    `optimizer` is any optax transformation, by default that of `config.schedule`; give `train_step` the same one. The
+    state may be donated: it shares no memory with `variables` or the optimizer. Raises ValueError for variables that do
+    not fit the config, and for frozen parts that do not exist.
     """
     if config.schedule.frozen:
         check_frozen(config)
     start = init_variables(key, config) if variables is None else fitting_variables(variables, config)
     params = jax.tree.map(jnp.asarray, start["params"])
-    # `step` and `skipped` are separate zeros, because a donated state must not hold one buffer twice.
-    return TrainState(
+    state = TrainState(
         step=jnp.zeros((), jnp.int32),
         params=params,
-        batch_stats=jax.tree.map(jnp.asarray, start["batch_stats"]),
+        batch_stats=start["batch_stats"],
         optimizer=(optimizer or make_optimizer(config.schedule)).init(params),
-        ema=jax.tree.map(jnp.copy, params) if config.schedule.ema_decay else None,
+        ema=params if config.schedule.ema_decay else None,
         skipped=jnp.zeros((), jnp.int32),
     )
+    # A donated state must not hold one buffer twice, and the states of many optimizers hold the parameters.
+    return jax.tree.map(jnp.copy, state)
 
 
 def train_step(
@@ -63,7 +65,8 @@ def train_step(
     """Update the state from a batch of padded scenes [B, ...]: voxelise, network, targets, losses, optimiser.
 
     `config`, `optimizer` and `axis_name` are static: `jax.jit(partial(train_step, config=config, optimizer=...))`.
-    `optimizer` is that of `create_train_state`.
+    `optimizer` is that of `create_train_state`; of `config.schedule` it replaces the learning rate, weight decay,
+    clipping and accumulation.
 
     Returns the new state, which is that of `apply_gradients`, and scalar metrics: `loss` and its unweighted terms
     `classification`, `box`, `direction` and `iou` (means over scenes), `positives` (positive anchors per scene),
@@ -138,7 +141,9 @@ def compute_loss(
         "sites_dropped": sites_dropped,
     }
     sums = {name: jnp.sum(each) for name, each in counts.items()}
-    return jnp.asarray(terms.total), LossOutput(terms, targets, predictions, updated["batch_stats"], sums)
+    # Of the type that was given, as the state's tree must not change: Flax returns a dictionary for a FrozenDict.
+    new_stats = jax.tree.unflatten(jax.tree.structure(batch_stats), jax.tree.leaves(updated["batch_stats"]))
+    return jnp.asarray(terms.total), LossOutput(terms, targets, predictions, new_stats, sums)
 
 
 def apply_gradients(
@@ -151,12 +156,16 @@ def apply_gradients(
 ) -> TrainState:
     """Return the state after one update by `gradient`, with the batch statistics of `output`.
 
-    `optimizer` is that of `create_train_state`. Frozen parts keep their parameters, whatever the optimiser does. If the
-    loss or the gradient norm is not finite, only `step` and `skipped` change.
+    `optimizer` is that of `create_train_state`; one that evaluates the loss itself, such as `optax.lbfgs`, needs a step
+    of its own. Frozen parts keep their parameters, whatever the optimiser does. If the loss or the gradient norm is not
+    finite, only `step` and `skipped` change. Raises ValueError, while it is traced, for a state of another optimiser,
+    and for one without the running mean that the config asks for.
     """
     frozen, decay = config.schedule.frozen, config.schedule.ema_decay
+    optimizer = optimizer or make_optimizer(config.schedule)
+    _check_state(state, optimizer, decay)
     finite = jnp.isfinite(_norm(gradient)) & jnp.isfinite(output.terms.total)
-    update = optax.with_extra_args_support(optimizer or make_optimizer(config.schedule)).update
+    update = optax.with_extra_args_support(optimizer).update
     # The loss serves transformations that adapt to it, such as `optax.contrib.reduce_on_plateau`.
     changes, optimizer_state = update(gradient, state.optimizer, state.params, value=output.terms.total)
     params = keep_frozen(optax.apply_updates(state.params, changes), state.params, frozen)
@@ -166,6 +175,14 @@ def apply_gradients(
     changed = TrainState(state.step, params, output.batch_stats, optimizer_state, ema, state.skipped)
     chosen = jax.tree.map(lambda new, old: jnp.where(finite, new, old), changed, state)
     return chosen._replace(step=state.step + 1, skipped=state.skipped + (~finite).astype(jnp.int32))
+
+
+def _check_state(state: TrainState, optimizer: optax.GradientTransformation, decay: float) -> None:
+    expected: Any = jax.tree.structure(jax.eval_shape(optimizer.init, state.params))
+    if expected != jax.tree.structure(state.optimizer):
+        raise ValueError("The state is that of another optimizer; give `create_train_state` the same `optimizer`.")
+    if decay and state.ema is None:
+        raise ValueError(f"The state has no `ema`, but schedule.ema_decay is {decay}; create it with this config.")
 
 
 def _norm(gradient: Any) -> jax.Array:

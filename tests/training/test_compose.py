@@ -5,6 +5,7 @@ from functools import cache, partial
 from typing import Any
 
 import chex
+import flax.core
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -200,6 +201,33 @@ def test_an_unknown_part_is_named_before_anything_is_compiled(parts, says):
     state = fresh(with_frozen())
     with pytest.raises(ValueError, match=says):
         jax.eval_shape(partial(train_step, config=config), state, batch())
+
+
+def test_the_state_of_another_config_or_optimizer_is_named(no_type_checks):
+    state, gradient, output = little_state(optax.sgd(0.1))
+    with pytest.raises(ValueError, match=r"of another optimizer; give `create_train_state` the same `optimizer`"):
+        apply_gradients(state, gradient, output, with_frozen())
+    with pytest.raises(ValueError, match=r"no `ema`, but schedule.ema_decay is 0.5"):
+        apply_gradients(state, gradient, output, with_frozen(ema_decay=0.5), optimizer=optax.sgd(0.1))
+
+
+def test_a_state_that_is_donated_shares_no_memory():
+    """The states of these optimizers begin with the parameters, and with a key that the optimizer keeps."""
+    optimizer = optax.chain(optax.add_noise(0.01, 0.55, jax.random.key(0)), optax.contrib.dog())
+    variables = jax.tree.map(jnp.asarray, random_variables(small_config()))
+    config = with_frozen(ema_decay=0.9)
+    for _ in range(2):
+        state = create_train_state(jax.random.key(0), config, variables=variables, optimizer=optimizer)
+        jax.jit(lambda state: jax.tree.map(jnp.copy, state), donate_argnums=0)(state)
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves(variables))
+
+
+def test_the_tree_of_a_state_keeps_its_type():
+    config, optimizer = with_frozen("backbone"), optax.sgd(0.1)
+    state = fresh(config, optimizer)
+    frozen = state._replace(params=flax.core.freeze(state.params), batch_stats=flax.core.freeze(state.batch_stats))
+    after, _ = jax.eval_shape(partial(train_step, config=config, optimizer=optimizer), frozen, batch())
+    assert jax.tree.structure(after) == jax.tree.structure(frozen)
 
 
 def test_misfits_are_named_before_anything_is_compiled(no_type_checks):
