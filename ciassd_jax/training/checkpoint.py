@@ -20,12 +20,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ciassd_jax.config import Config
+from ciassd_jax.config import Config, ScheduleConfig
 from ciassd_jax.data.loader import LoaderState
 from ciassd_jax.formats.errors import FormatWarning, InputError, Pathlike
 from ciassd_jax.formats.writing import check_folder
 from ciassd_jax.model.network import variable_shapes
 from ciassd_jax.training.distributed import on_process_0
+from ciassd_jax.training.optimizer import make_optimizer
 from ciassd_jax.types import TrainState, Variables
 
 # Version of a checkpoint's content; 2 since the optimizer works on one vector of all parameters.
@@ -117,7 +118,7 @@ class Checkpoints:
                 progress = self._read(step, progress=ocp.args.JsonRestore())["progress"]
                 _check_format(progress, self.folder / str(step))
                 _check_config(progress["config"], self._config, self.folder / str(step))
-                _check_optimizer(progress.get("optimizer"), like, self.folder / str(step))
+                _check_optimizer(progress.get("optimizer"), like, self._config.schedule, self.folder / str(step))
                 _check_arrays(self.folder / str(step) / "state")
                 state = self._read(step, state=ocp.args.StandardRestore(_abstract(like)))["state"]
             except InputError:
@@ -267,9 +268,11 @@ def _structure(state: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _check_optimizer(saved: str | None, like: TrainState, path: Path) -> None:
+def _check_optimizer(saved: str | None, like: TrainState, schedule: ScheduleConfig, path: Path) -> None:
     """Raise InputError for the state of another optimizer; a checkpoint of an earlier version has the default one's."""
-    if saved is not None and saved != _structure(like.optimizer):
+    if saved is None:
+        saved = _structure(jax.eval_shape(make_optimizer(schedule).init, like.params))
+    if saved != _structure(like.optimizer):
         raise InputError(
             f"{path} has the state of another optimizer; use the optimizer that the run was started with, or another "
             "folder."

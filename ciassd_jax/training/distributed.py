@@ -111,7 +111,12 @@ def replicated(mesh: Mesh) -> NamedSharding:
 
 def replicate(tree: Tree, mesh: Mesh) -> Tree:
     """Copy a tree, equal in all processes, to every device; its leaves share no memory, so that they can be donated."""
-    return jax.device_put(jax.tree.map(np.array, tree), replicated(mesh), may_alias=False)
+
+    def on_host(leaf: Any) -> Any:
+        # NumPy has no keys of random numbers, which the states of noisy optimizers hold.
+        return leaf if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) else np.array(leaf)
+
+    return jax.device_put(jax.tree.map(on_host, tree), replicated(mesh), may_alias=False)
 
 
 def shard_batch(batch: Scene, mesh: Mesh) -> Scene:

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from small import random_variables, small_config
@@ -20,6 +21,7 @@ from ciassd_jax import create_train_state
 from ciassd_jax.data.loader import LoaderState
 from ciassd_jax.formats.errors import FormatWarning, InputError
 from ciassd_jax.model.checks import variables_of
+from ciassd_jax.training import distributed
 from ciassd_jax.training.checkpoint import Checkpoints, checkpoint_steps, checkpoint_variables, first_difference
 from ciassd_jax.types import TrainState
 
@@ -167,6 +169,30 @@ def edit_progress(folder: Path, edit: Callable[[dict], object]) -> None:
     progress = json.loads(path.read_text())
     edit(progress)
     path.write_text(json.dumps(progress))
+
+
+@pytest.mark.parametrize("earlier", [False, True], ids=["now", "by an earlier version"])
+def test_another_optimizer_is_refused_and_nothing_is_removed(tmp_path: Path, state: TrainState, earlier: bool) -> None:
+    save(tmp_path, state, {2: None})
+    if earlier:
+        edit_progress(tmp_path / "2", lambda progress: progress.pop("optimizer"))
+    other = state._replace(optimizer=optax.sgd(0.1, momentum=0.9).init(state.params))
+    with Checkpoints(tmp_path, CONFIG) as checkpoints:
+        with pytest.raises(InputError, match=r"2 has the state of another optimizer; use the optimizer that"):
+            checkpoints.restore(other)
+        assert checkpoints.steps == [2]
+        assert checkpoints.restore(state) is not None
+
+
+def test_the_key_of_a_noisy_optimizer_is_kept(tmp_path: Path) -> None:
+    optimizer = optax.chain(optax.add_noise(0.01, 0.55, jax.random.key(7)), optax.sgd(0.1))
+    state = create_train_state(jax.random.key(0), CONFIG, variables=random_variables(CONFIG), optimizer=optimizer)
+    state = distributed.replicate(state, distributed.data_mesh(1))
+    with Checkpoints(tmp_path, CONFIG) as checkpoints:
+        checkpoints.save(state._replace(step=state.step + 1), LOADER)
+        restored = checkpoints.restore(state)
+    assert restored is not None
+    assert (jax.random.key_data(restored.state.optimizer[0].rng_key) == jax.random.key_data(jax.random.key(7))).all()
 
 
 def test_a_run_of_an_earlier_format_is_refused_and_kept(tmp_path: Path, state: TrainState) -> None:
