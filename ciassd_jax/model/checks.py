@@ -62,15 +62,22 @@ def check_variables(variables: Variables, expected: Any) -> None:
 
 def check_cloud(cloud: PointCloud, frustum: Any = None) -> None:
     """Raise ValueError unless a cloud is a batch: float32 points [B, P, 4], integer count [B], frustum [B, 6, 4]."""
+    if not isinstance(cloud, PointCloud) or any(isinstance(leaf, list | tuple) for leaf in cloud):
+        kinds = f" of {type(cloud.points).__name__}" if isinstance(cloud, PointCloud) else ""
+        raise ValueError(
+            f"The cloud is a {type(cloud).__name__}{kinds}; give a `PointCloud` of two arrays, points [B, P, 4] and "
+            "count [B]."
+        )
     shape, count = np.shape(cloud.points), np.shape(cloud.count)
     if len(shape) == 2:
         raise ValueError(
             f"points have the shape {shape} without a batch axis; add one, for a single cloud `points[None]` and "
             "`count[None]`."
         )
-    if len(shape) != 3 or shape[2] != 4:
+    if len(shape) != 3 or shape[2] != 4 or 0 in shape:
         raise ValueError(
-            f"points have the shape {shape}; give [B, P, 4]: x, y, z in metres and intensity of each point."
+            f"points have the shape {shape}; give [B, P, 4] with B and P of at least 1: x, y, z in metres and "
+            "intensity of each point."
         )
     if count != shape[:1]:
         raise ValueError(f"count has the shape {count}; give {shape[:1]}, the number of points of each cloud.")

@@ -37,6 +37,20 @@ BAD_CLOUDS = {
         "of type int32 and int32; convert them to float",
     ),
     "half precision": (CLOUD._replace(points=CLOUD.points.astype(np.float16)), "of type float16 and int32; convert"),
+    "a tuple": (
+        tuple(CLOUD),
+        r"^The cloud is a tuple; give a `PointCloud` of two arrays, points \[B, P, 4\] and count",
+    ),
+    "points alone": (CLOUD.points, "^The cloud is a .*; give a `PointCloud` of two arrays"),
+    "lists": (
+        CLOUD._replace(points=CLOUD.points.tolist()),
+        "^The cloud is a PointCloud of list; give a `PointCloud` of",
+    ),
+    "no scene": (
+        PointCloud(CLOUD.points[:0], CLOUD.count[:0]),
+        r"shape \(0, 64, 4\); give \[B, P, 4\] with B and P of",
+    ),
+    "no point": (CLOUD._replace(points=CLOUD.points[:, :0]), r"shape \(2, 0, 4\); give \[B, P, 4\] with B and P of"),
     "count of floats": (CLOUD._replace(count=np.zeros(2, np.float32)), "of type float32 and float32; convert"),
 }
 
