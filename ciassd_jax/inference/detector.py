@@ -178,6 +178,8 @@ def pad_clouds(clouds: Sequence[np.ndarray], batch_size: int, num_points: int) -
 
 def _each_cloud(points: Iterable[Array], frustum: Any, source: Iterable[Pathlike] | None) -> Iterator[_Cloud]:
     """Yield each cloud with its frustum and its name."""
+    if isinstance(source, str | os.PathLike):
+        source = [source]
     shared = frustum is None or (isinstance(frustum, np.ndarray | jax.Array) and frustum.ndim == 2)
     lists = [points] + [frustum] * (not shared) + [source] * (source is not None)
     lengths = [len(given) for given in lists if isinstance(given, Sized)]

@@ -122,7 +122,7 @@ class ExportedDetector(Detector):
             )
         start = time.perf_counter()
         planes = np.zeros((self.batch_size, *ANYWHERE.shape), np.float32)
-        planes[: len(frustum)] = frustum
+        planes[: len(clouds)] = frustum[: len(clouds)]
         found = jax.device_get(self._program(*pad_clouds(clouds, self.batch_size, self.num_points), planes))
         counts = Counts(**{name: found[name] for name in Counts._fields})
         boxes = Boxes.from_array(found["boxes"])

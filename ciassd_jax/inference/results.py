@@ -32,7 +32,7 @@ BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 _TEXT_ROWS, _TABLE_ROWS = 10, 20
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FrameResult:
     """Detections of one frame as NumPy arrays.
 

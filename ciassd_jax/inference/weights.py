@@ -220,7 +220,7 @@ def _match(file: _File, shapes: Mapping[str, tuple[int, ...]]) -> tuple[list[Ten
         expected = shapes.get(target) if source in file.rules else None
         if not target:
             status = "counter"
-        elif not np.isfinite(value).all():
+        elif not _is_finite(value):
             status = "not finite"
         elif expected is None:
             status = "left: not in the config"
@@ -232,6 +232,12 @@ def _match(file: _File, shapes: Mapping[str, tuple[int, ...]]) -> tuple[list[Ten
     reported = {row.target for row in report if row.expected is not None}
     absent = [name for name in shapes if name not in reported]
     return report + [TensorReport("", name, None, shapes[name], "fresh: not in the file") for name in absent], found
+
+
+@np.errstate(over="ignore")
+def _is_finite(value: np.ndarray) -> bool:
+    """Whether the values are finite in float32, which they are used in."""
+    return bool(np.isfinite(value.astype(np.float32, copy=False)).all())
 
 
 def _describe(row: TensorReport) -> str:

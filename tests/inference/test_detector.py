@@ -120,6 +120,7 @@ def test_a_message_names_its_cloud(detector: Detector) -> None:
         ({"frustum": [None]}, r"points, frustum and source differ in length \(2 and 1\); give one of each"),
         ({"frustum": np.zeros((5, 4))}, r"Cloud 0: its frustum has the shape \(5, 4\); give the planes \[6, 4\]"),
         ({"source": ["a", "b", "c"]}, r"differ in length \(2 and 3\)"),
+        ({"source": "ab"}, r"differ in length \(2 and 1\)"),
     ],
 )
 @pytest.mark.usefixtures("no_type_checks")

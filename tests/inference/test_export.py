@@ -108,6 +108,7 @@ def test_a_larger_cloud_or_batch_is_refused(exported: Any) -> None:
         exported(small_cloud(count=641))
     with pytest.raises(ValueError, match=f"3 clouds exceed the exported batch of {BATCH}; .*`batch` 3"):
         exported([small_cloud()] * 3, batch_size=3)
+    assert len(exported([small_cloud()], batch_size=3)) == 1
 
 
 def test_the_manifest_describes_the_program(path: Path, exported: Any) -> None:

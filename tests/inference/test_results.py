@@ -79,6 +79,13 @@ def test_detections_are_chosen_as_in_an_array() -> None:
         RESULT[4]
 
 
+def test_results_lie_in_lists_and_sets() -> None:
+    """They are compared by identity, as their arrays have no single truth."""
+    other = RESULT[:]
+    assert [other, RESULT].index(RESULT) == 1
+    assert len({other, RESULT}) == 2
+
+
 def test_corners_are_those_of_the_footprints_and_of_the_outlines() -> None:
     corners = RESULT.corners
     assert corners.shape == (4, 8, 3)

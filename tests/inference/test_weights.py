@@ -104,8 +104,9 @@ def test_our_file_must_fit_exactly(ours: Path, change: Any, message: str) -> Non
         load_weights(edit(ours, change))
 
 
-def test_values_that_are_not_finite_are_refused(ours: Path) -> None:
-    edit(ours, lambda tensors: tensors.update({NAME: tensors[NAME] * np.nan}))
+@pytest.mark.parametrize("value", [np.nan, np.float64(1e39)], ids=["nan", "beyond float32"])
+def test_values_that_are_not_finite_are_refused(ours: Path, value: float) -> None:
+    edit(ours, lambda tensors: tensors.update({NAME: np.full_like(tensors[NAME], value, type(value))}))
     for options in ({}, {"config": three_classes(), "partial": True}):
         with pytest.raises(InputError, match=f"not finite in {NAME}; give other weights"):
             load_weights(ours, **options)
