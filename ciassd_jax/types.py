@@ -274,15 +274,19 @@ def _describe_record(record: Any) -> str:
 
 
 def _describe(value: Any) -> str:
-    if hasattr(value, "shape") and hasattr(value, "dtype"):
+    if _is_array(value):
         if _is_printed(value):
             return np.array2string(np.asarray(jax.device_get(value)), precision=4, separator=", ")
         return f"{value.dtype.name}[{', '.join(map(str, value.shape))}]"
-    if value is None or type(value).__repr__ is _describe_record or jax.tree_util.all_leaves([value]):
-        return repr(value)
     leaves = jax.tree.leaves(value)
+    if type(value).__repr__ is _describe_record or not any(map(_is_array, leaves)):
+        return repr(value)
     numbers = sum(math.prod(getattr(leaf, "shape", ())) for leaf in leaves)
     return f"{{{len(leaves)} arrays, {numbers:,} numbers}}"
+
+
+def _is_array(value: Any) -> bool:
+    return hasattr(value, "shape") and hasattr(value, "dtype") and not isinstance(value, type)
 
 
 def _is_printed(array: Any) -> bool:

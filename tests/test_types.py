@@ -77,6 +77,8 @@ OTHERS: dict[str, tuple[Any, str]] = {
     "key": (jax.random.key(0), "key<fry>[]"),
     "bfloat16": (jnp.bfloat16(1.5), "1.5"),
     "text": ("x", "'x'"),
+    "class": (np.ndarray, "<class 'numpy.ndarray'>"),
+    "dimensions": ((2, 3), "(2, 3)"),
 }
 
 
