@@ -10,6 +10,7 @@ from ciassd_jax.formats.errors import InputError
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.export import export_predict, load_exported
 from ciassd_jax.inference.predict import predict
+from ciassd_jax.inference.programs import keep_programs
 from ciassd_jax.inference.weights import load_weights, save_weights
 from ciassd_jax.model.network import init_variables, predict_features
 from ciassd_jax.simulation import open_synthetic
@@ -45,6 +46,7 @@ __all__ = [
     "export_predict",
     "fit",
     "init_variables",
+    "keep_programs",
     "load_exported",
     "load_weights",
     "losses",

@@ -193,13 +193,14 @@ class LossTerms(NamedTuple):
 class LossOutput(NamedTuple):
     """What `compute_loss` finds besides the loss.
 
-    `terms` are means over the scenes, `batch_stats` the new running statistics, `predictions` the network's output.
-    `counts` are the overflow counts by name, sums over the scenes.
+    `terms` are means over the scenes, `batch_stats` the new running statistics, `predictions` the network's output and
+    `features` the BEV map that the head read. `counts` are the overflow counts by name, sums over the scenes.
     """
 
     terms: LossTerms
     targets: Targets
     predictions: Predictions
+    features: Float[Array, "B H W C"]
     batch_stats: Any
     counts: dict[str, jax.Array]
 

@@ -20,7 +20,7 @@ from ciassd_jax.cli.options import File, Unset
 from ciassd_jax.config import Config
 from ciassd_jax.config.presets import PRESETS
 from ciassd_jax.inference.scoring import find_trained
-from ciassd_jax.inference.weights import Weights, find_weights, load_weights, read_config
+from ciassd_jax.inference.weights import Weights, load_weights, read_config
 
 if TYPE_CHECKING:
     Preset = str
@@ -83,10 +83,9 @@ class ConfigOptions:
 
     def load(self, path: Path, short: Mapping[str, Any] | None = None) -> Weights:
         """Load weights from a file or by the name of bundled ones, with the chosen config, by default their own."""
-        file = find_weights(path)
-        weights = load_weights(file)
+        weights = load_weights(path)
         config = self.resolve(weights.config, short)
-        return weights if config == weights.config else load_weights(file, config)
+        return weights if config == weights.config else load_weights(path, config)
 
 
 def _replace_field(config: Config, name: str, value: Any) -> Config:
@@ -161,4 +160,4 @@ def _source(arguments: Sequence[str]) -> Config:
         weights = find_trained(named.workdir)
     if arguments[0] in ("demo", "bench") and weights is None:
         weights = Path("car_lite")
-    return named.config_options.chosen(read_config(find_weights(weights)) if weights else None)
+    return named.config_options.chosen(read_config(weights) if weights else None)

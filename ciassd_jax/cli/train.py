@@ -24,7 +24,7 @@ from ciassd_jax.data.scenes import check_targets
 from ciassd_jax.data.workers import WorkerError
 from ciassd_jax.formats.errors import warn_of_file
 from ciassd_jax.formats.writing import check_folder
-from ciassd_jax.inference.weights import find_weights, load_weights, read_config
+from ciassd_jax.inference.weights import load_weights, read_config
 from ciassd_jax.model.frozen import check_frozen
 from ciassd_jax.training.distributed import ParallelError, connect, is_process_0, on_process_0, shard
 from ciassd_jax.training.loop import Intervals, TrainingError, fit
@@ -158,7 +158,7 @@ class Train:
         given = {f"schedule.{one.name}": getattr(self, one.name, None) for one in fields(ScheduleConfig)}
         given |= {"dtype": self.dtype, "schedule.total_steps": self.steps, "schedule.frozen": self.freeze}
         usual = _OVERFIT if self.overfit_one is not None else None
-        own = read_config(find_weights(self.init_from)) if self.init_from is not None else None
+        own = read_config(self.init_from) if self.init_from is not None else None
         config = self.config_options.resolve(own, given, usual)
         if self.epochs is not None:
             steps = self.epochs * frames // config.schedule.batch_size
@@ -208,7 +208,7 @@ class Train:
     def _variables(self, config: Config, log: Callable[[str], object]) -> Variables | None:
         weights = None
         if self.init_from is not None:
-            weights = load_weights(find_weights(self.init_from), config, self.partial, jax.random.key(self.seed))
+            weights = load_weights(self.init_from, config, self.partial, jax.random.key(self.seed))
         resumed = any(path.name.isdecimal() for path in self.workdir.glob("checkpoints/*"))
         if self.partial and weights is not None and not resumed:
             log(f"Taken from {self.init_from}:\n{describe_taken(weights.report)}")

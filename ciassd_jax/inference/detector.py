@@ -19,7 +19,7 @@ from ciassd_jax.formats.errors import DroppedWarning, Pathlike, warn_of_file
 from ciassd_jax.formats.points import check_intensity
 from ciassd_jax.inference.predict import compile_predict
 from ciassd_jax.inference.results import FrameResult, frame_result
-from ciassd_jax.inference.weights import find_weights, load_weights
+from ciassd_jax.inference.weights import load_weights
 from ciassd_jax.model.network import fitting_variables
 from ciassd_jax.ops.camera import ANYWHERE
 from ciassd_jax.ops.voxelize import MAX_INTENSITY
@@ -33,7 +33,8 @@ class Detector:
     """A network with its weights: points in, detections out.
 
     Clouds are padded to one of a few sizes, and the program is compiled once per size. Detectors whose configs differ
-    only in training share their programs. Raises ValueError for variables that do not fit the config.
+    only in training share their programs. `variables` and `config` are those of the network. Raises ValueError for
+    variables that do not fit the config.
     """
 
     # Of several clouds, how many are detected at a time.
@@ -41,7 +42,7 @@ class Detector:
 
     def __init__(self, variables: Variables, config: Config) -> None:
         self.config = config
-        self._variables = jax.device_put(jax.device_get(fitting_variables(variables, config)))
+        self.variables = jax.device_put(jax.device_get(fitting_variables(variables, config)))
         self._is_first = True
 
     @classmethod
@@ -52,10 +53,15 @@ class Detector:
 
         `intensity_scale` and `z_shift` replace those of `config.input`, for clouds of another sensor.
         """
-        weights = load_weights(find_weights(path_or_name))
+        weights = load_weights(path_or_name)
         given = {"intensity_scale": intensity_scale, "z_shift": z_shift}
         changed = {name: float(value) for name, value in given.items() if value is not None}
         return cls(weights.variables, replace(weights.config, input=replace(weights.config.input, **changed)))
+
+    def __repr__(self) -> str:
+        (x, y, _), (right, left, _) = self.config.range
+        area = f"x {x:g}..{right:g}, y {y:g}..{left:g} m"
+        return f"{type(self).__name__}({', '.join(self.config.class_names)} in {area})"
 
     @overload
     def __call__(  # type: ignore[overload-overlap]  # an array is not taken for an iterable of clouds
@@ -127,7 +133,7 @@ class Detector:
         program = self.compile(max(map(len, clouds)), len(frustum))
         start = time.perf_counter()
         padded = pad_to_bucket(*clouds, batch_size=len(frustum))
-        return jax.device_get(program(self._variables, padded, frustum=frustum)), time.perf_counter() - start
+        return jax.device_get(program(self.variables, padded, frustum=frustum)), time.perf_counter() - start
 
     def _describe_first(self, points: np.ndarray, source: Pathlike) -> None:
         """Give the hints on the first cloud; those on the others would be the same."""

@@ -26,11 +26,12 @@ def predict(
 ) -> Detections:
     """Detect objects in a batch of padded clouds. Pure; under `jax.jit` the config is static.
 
-    `state_or_variables` is a train state, or a mapping {"params": ..., "batch_stats": ...}. `cloud` holds float32
-    points [B, P, 4] (x, y, z in metres, intensity in [0, 1]) and count [B]. `frustum` (`ops.camera.frustum_planes`)
-    drops boxes whose centre is outside the camera's view, as the released code does. Return at most
-    `config.detection.max_candidates` boxes per scene, in the order of selection, with yaw in [-pi, pi). Raises
-    ValueError for arguments of another shape or type; under `jax.jit` it does so while it is traced.
+    `state_or_variables` is a train state, or a mapping {"params": ..., "batch_stats": ...} such as
+    `load_weights(...).variables`. `cloud` holds float32 points [B, P, 4] (x, y, z in metres, intensity in [0, 1]) and
+    count [B]. `frustum` (`ops.camera.frustum_planes`) drops boxes whose centre is outside the camera's view, as the
+    released code does. Return at most `config.detection.max_candidates` boxes per scene, in the order of selection,
+    with yaw in [-pi, pi). Raises ValueError for arguments of another shape or type; under `jax.jit` it does so while
+    it is traced.
     """
     check_cloud(cloud, frustum)
     return postprocess(predict_raw(state_or_variables, cloud, config), config, frustum=frustum)

@@ -57,6 +57,11 @@ class Weights(NamedTuple):
     config: Config
     report: list[TensorReport]
 
+    def __repr__(self) -> str:
+        numbers = sum(np.size(leaf) for leaf in jax.tree.leaves(self.variables))
+        classes = ", ".join(self.config.class_names)
+        return f"Weights(variables={{{numbers:,} numbers}}, config={{{classes}}}, report=[{len(self.report)} tensors])"
+
 
 class _File(NamedTuple):
     """The tensors of a file, their names here, and the config that it was written for."""
@@ -69,7 +74,7 @@ class _File(NamedTuple):
 def load_weights(
     path: str | os.PathLike[str], config: Config | None = None, partial: bool = False, key: jax.Array | None = None
 ) -> Weights:
-    """Read a `.safetensors` file of this package, or a released `.pth`.
+    """Read a `.safetensors` file of this package, a released `.pth`, or bundled weights by name, such as "car_lite".
 
     The tensors must be exactly those of `config`, by default the file's own. With `partial`, those whose name and shape
     fit are taken, and the others are drawn from `key` (by default `jax.random.key(0)`) as by `init_variables`; the
@@ -79,15 +84,17 @@ def load_weights(
     """
     if partial and config is None:
         raise ValueError("`partial` loads the tensors that fit a `config`; give both.")
+    path = find_weights(path)
     return _assemble(_read(path), path, config, partial, key)
 
 
 def read_config(path: str | os.PathLike[str]) -> Config:
-    """Read the config of a weights file, or a JSON file of `Config.to_json`.
+    """Read the config of weights, as for `load_weights`, or a JSON file of `Config.to_json`.
 
     Raises InputError for a file without a valid config.
     """
-    suffix = Path(path).suffix
+    path = find_weights(path)
+    suffix = path.suffix
     if suffix == ".json":
         try:
             return Config.from_json(read_text(path))

@@ -20,30 +20,31 @@ from ciassd_jax.ops.voxelize import voxelize
 from ciassd_jax.types import PointCloud, Predictions, SparseVoxels, Variables
 
 
+class NetworkOutput(NamedTuple):
+    """Raw predictions for every anchor, the BEV features that they come from, and the sites of each strided stage."""
+
+    predictions: Predictions
+    features: Float[Array, "B H W C"]
+    sites_kept: Int[Array, "B S"]
+    sites_dropped: Int[Array, "B S"]
+
+
 class CIASSD(nn.Module):
     """Voxels of a batch of scenes to raw predictions for every anchor."""
 
     config: Config
     axis_name: str | None = None
 
-    def setup(self) -> None:
+    @nn.compact
+    def __call__(self, voxels: SparseVoxels, *, train: bool = False) -> NetworkOutput:
         config, dtype = self.config, jnp.dtype(self.config.dtype)
         how: dict[str, Any] = {"dtype": dtype, "axis_name": self.axis_name, "program": config.program}
-        self.backbone = SPConvNet(config.backbone, config.grid.shape, **how)
-        self.neck = (SSFA if config.neck.kind == "ssfa" else ConvolutionStack)(config.neck, **how)
-        self.head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, config.program)
-
-    def __call__(
-        self, voxels: SparseVoxels, *, train: bool = False
-    ) -> tuple[Predictions, Int[Array, "B S"], Int[Array, "B S"]]:
-        """Predictions, and the active sites kept and dropped at each strided stage of the backbone."""
-        bev, kept, dropped = self.backbone(voxels, train=train)
-        return self.head(self.neck(bev, train=train)), kept, dropped
-
-    def features(self, voxels: SparseVoxels) -> Float[Array, "B H W C"]:
-        """The BEV map that the head reads, in evaluation mode."""
-        bev, _, _ = self.backbone(voxels, train=False)
-        return self.neck(bev, train=False)
+        backbone = SPConvNet(config.backbone, config.grid.shape, **how, name="backbone")
+        bev, kept, dropped = backbone(voxels, train=train)
+        neck = SSFA if config.neck.kind == "ssfa" else ConvolutionStack
+        features = neck(config.neck, **how, name="neck")(bev, train=train)
+        head = MultiTaskHead(config.head, config.anchors_per_cell, dtype, config.program, name="head")
+        return NetworkOutput(head(features), features, kept, dropped)
 
 
 def init_variables(key: Array, config: Config) -> Any:
@@ -118,8 +119,8 @@ def predict_features(state_or_variables: Variables, cloud: PointCloud, config: C
     x = minimum + (w + 1/2) * cell, y likewise with h, where a cell has `config.backbone.stride` voxels.
     """
     variables = fitting_variables(state_or_variables, config)
-    features: Any = CIASSD(config).apply(variables, voxelize_batch(cloud, config), method="features")
-    return features
+    output: Any = CIASSD(config).apply(variables, voxelize_batch(cloud, config))
+    return output.features
 
 
 def predict_raw(state_or_variables: Variables, cloud: PointCloud, config: Config) -> RawPredictions:
@@ -132,8 +133,7 @@ def predict_raw(state_or_variables: Variables, cloud: PointCloud, config: Config
 def predict_voxels(state_or_variables: Variables, voxels: SparseVoxels, config: Config) -> RawPredictions:
     """Run the network in evaluation mode on a batch of voxelised scenes."""
     output: Any = CIASSD(config).apply(fitting_variables(state_or_variables, config), voxels)
-    predictions, kept, dropped = output
-    return RawPredictions(predictions, voxels, kept, dropped)
+    return RawPredictions(output.predictions, voxels, output.sites_kept, output.sites_dropped)
 
 
 def fitting_variables(state_or_variables: Variables, config: Config) -> dict[str, Any]:

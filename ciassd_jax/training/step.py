@@ -18,11 +18,11 @@ from jax import lax
 from ciassd_jax.config import Config
 from ciassd_jax.model.anchors import make_anchors
 from ciassd_jax.model.frozen import check_frozen, keep_frozen, running_statistics, stop_gradients
-from ciassd_jax.model.network import CIASSD, fitting_variables, init_variables, voxelize_batch
+from ciassd_jax.model.network import CIASSD, NetworkOutput, fitting_variables, init_variables, voxelize_batch
 from ciassd_jax.training.losses import detection_loss
 from ciassd_jax.training.optimizer import learning_rate, make_optimizer, momentum
 from ciassd_jax.training.targets import assign_targets
-from ciassd_jax.types import LossOutput, Scene, TrainState, Variables
+from ciassd_jax.types import LossOutput, Scene, SparseVoxels, TrainState, Variables
 
 
 def create_train_state(
@@ -121,13 +121,22 @@ def compute_loss(
 
     if config.schedule.remat:
         forward = jax.checkpoint(forward)
-    (predictions, sites_kept, sites_dropped), updated = forward(params)
+    network, updated = forward(params)
     anchors, labels = make_anchors(config)
     with jax.named_scope("targets"):
         assign = partial(assign_targets, anchors=anchors, anchor_labels=labels, classes=config.classes)
         targets = jax.vmap(assign)(batch.truth)
     with jax.named_scope("losses"):
-        terms = detection_loss(predictions, targets, anchors, config.loss)
+        terms = detection_loss(network.predictions, targets, anchors, config.loss)
+    # Of the type that was given, as the state's tree must not change: Flax returns a dictionary for a FrozenDict.
+    new_stats = jax.tree.unflatten(jax.tree.structure(batch_stats), jax.tree.leaves(updated["batch_stats"]))
+    counts = _count(batch, voxels, network)
+    output = LossOutput(terms, targets, network.predictions, network.features, new_stats, counts)
+    return jnp.asarray(terms.total), output
+
+
+def _count(batch: Scene, voxels: SparseVoxels, network: NetworkOutput) -> dict[str, jax.Array]:
+    """Return what was given, kept and dropped, as sums over the scenes."""
     counts = {
         "points_given": voxels.points_given,
         "points_cut": batch.points_cut,
@@ -137,13 +146,10 @@ def compute_loss(
         "objects_cut": batch.objects_cut,
         "voxels_kept": voxels.count,
         "voxels_dropped": voxels.dropped,
-        "sites_kept": sites_kept,
-        "sites_dropped": sites_dropped,
+        "sites_kept": network.sites_kept,
+        "sites_dropped": network.sites_dropped,
     }
-    sums = {name: jnp.sum(each) for name, each in counts.items()}
-    # Of the type that was given, as the state's tree must not change: Flax returns a dictionary for a FrozenDict.
-    new_stats = jax.tree.unflatten(jax.tree.structure(batch_stats), jax.tree.leaves(updated["batch_stats"]))
-    return jnp.asarray(terms.total), LossOutput(terms, targets, predictions, new_stats, sums)
+    return {name: jnp.sum(each) for name, each in counts.items()}
 
 
 def apply_gradients(

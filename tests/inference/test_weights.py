@@ -14,9 +14,9 @@ import safetensors.numpy
 from released import LAYOUTS, State, released_state, write_pth
 from small import random_variables, small_config
 
-from ciassd_jax import Config, car_lite, car_released, init_variables
+from ciassd_jax import Config, Detector, car_lite, car_released, init_variables
 from ciassd_jax.formats.errors import InputError
-from ciassd_jax.inference.weights import load_released_weights, load_weights, save_weights
+from ciassd_jax.inference.weights import load_released_weights, load_weights, read_config, save_weights
 
 
 def released_file(folder: Path, state: State) -> Path:
@@ -339,3 +339,13 @@ def test_golden_weights_load_with_every_tensor_accounted_for(shared: Path) -> No
 def test_a_part_of_the_golden_weights_is_refused(shared: Path) -> None:
     with pytest.raises(InputError, match=r"weights_legacy_format_sample\.pth (does not fit|has sparse kernels)"):
         load_weights(shared / "golden" / "weights_legacy_format_sample.pth")
+
+
+def test_bundled_weights_load_by_name_and_print_short():
+    weights = load_weights("car_lite")
+    assert weights.config.class_names == ("Car",)
+    assert read_config("car_lite") == weights.config
+    assert repr(weights) == "Weights(variables={841,822 numbers}, config={Car}, report=[118 tensors])"
+    assert repr(Detector(weights.variables, weights.config)) == "Detector(Car in x 0..70.4, y -40..40 m)"
+    with pytest.raises(InputError, match="No bundled weights are named 'car_litle'"):
+        load_weights("car_litle")

@@ -97,7 +97,7 @@ def golden(shared: Path) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("frame", FRAMES)
 def test_active_sites(shared: Path, golden: dict, frame: str) -> None:
-    _, voxels, (_, kept, dropped), _ = result(shared, frame)
+    _, voxels, (_, _, kept, dropped), _ = result(shared, frame)
     counts = golden[f"{frame}_stage_active_counts"]
     assert int(voxels.count[0]) == counts[0]
     np.testing.assert_array_equal(kept[0], counts[[2, 5, 9, 13]])
@@ -185,7 +185,7 @@ def test_the_other_iou_head(shared: Path, golden: dict, frame: str) -> None:
 @pytest.mark.parametrize("frame", FRAMES)
 def test_final_boxes(shared: Path, golden: dict, frame: str) -> None:
     weights, _ = network(shared)
-    _, voxels, (predictions, kept, dropped), _ = result(shared, frame)
+    _, voxels, (predictions, _, kept, dropped), _ = result(shared, frame)
     height, width = golden[f"{frame}_image_shape"]
     projection = golden[f"{frame}_P2"][:3] @ golden[f"{frame}_R0_rect"] @ golden[f"{frame}_Tr_velo_to_cam"]
     planes = frustum_planes(projection, width=int(width), height=int(height))[None].astype(np.float32)

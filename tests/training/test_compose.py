@@ -61,6 +61,8 @@ def test_the_parts_make_the_step(composed):
     assert counts["points_given"] == int(batch().cloud.count.sum())
     assert counts["boxes_given"] == 4
     assert output.predictions.class_logit.shape == output.targets.label.shape
+    features = jax.jit(predict_features)(state, batch().cloud, config)
+    assert output.features.shape == features.shape
 
 
 def little_state(optimizer: optax.GradientTransformation) -> tuple[TrainState, Any, LossOutput]:
@@ -72,7 +74,7 @@ def little_state(optimizer: optax.GradientTransformation) -> tuple[TrainState, A
     )
     zero = jnp.zeros((), jnp.int32)
     terms = LossTerms(*jnp.arange(5.0))
-    return TrainState(zero, params, {}, optimizer.init(params), None, zero), gradient, LossOutput(terms, *4 * ({},))
+    return TrainState(zero, params, {}, optimizer.init(params), None, zero), gradient, LossOutput(terms, *5 * ({},))
 
 
 def updated(optimizer: optax.GradientTransformation, config: Config) -> tuple[TrainState, TrainState, Any]:
