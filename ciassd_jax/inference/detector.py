@@ -29,34 +29,13 @@ from ciassd_jax.types import Array, Detections, PointCloud, Variables
 SMALLEST_BUCKET = 32768
 
 
-class Detector:
-    """A network with its weights: points in, detections out.
+class CloudDetector:
+    """Points in, detections out, whatever program detects them; `config` is that of its network."""
 
-    Clouds are padded to one of a few sizes, and the program is compiled once per size. Detectors whose configs differ
-    only in training share their programs. `variables` and `config` are those of the network. Raises ValueError for
-    variables that do not fit the config.
-    """
-
+    config: Config
     # Of several clouds, how many are detected at a time.
     batch_size = 1
-
-    def __init__(self, variables: Variables, config: Config) -> None:
-        self.config = config
-        self.variables = jax.device_put(jax.device_get(fitting_variables(variables, config)))
-        self._is_first = True
-
-    @classmethod
-    def from_pretrained(
-        cls, path_or_name: str | os.PathLike[str], *, intensity_scale: float | None = None, z_shift: float | None = None
-    ) -> Detector:
-        """Load a weights file (.safetensors, or a released .pth), or bundled weights by name.
-
-        `intensity_scale` and `z_shift` replace those of `config.input`, for clouds of another sensor.
-        """
-        weights = load_weights(path_or_name)
-        given = {"intensity_scale": intensity_scale, "z_shift": z_shift}
-        changed = {name: float(value) for name, value in given.items() if value is not None}
-        return cls(weights.variables, replace(weights.config, input=replace(weights.config.input, **changed)))
+    _is_first = True
 
     def __repr__(self) -> str:
         (x, y, _), (right, left, _) = self.config.range
@@ -129,11 +108,8 @@ class Detector:
         return results
 
     def _run(self, clouds: Sequence[np.ndarray], frustum: np.ndarray) -> tuple[Detections, float]:
-        """Return the detections of a batch that empty clouds fill, and the seconds without compilation."""
-        program = self.compile(max(map(len, clouds)), len(frustum))
-        start = time.perf_counter()
-        padded = pad_to_bucket(*clouds, batch_size=len(frustum))
-        return jax.device_get(program(self.variables, padded, frustum=frustum)), time.perf_counter() - start
+        """Return the detections of a batch, which has a frustum for each place, and the seconds without compilation."""
+        raise NotImplementedError
 
     def _describe_first(self, points: np.ndarray, source: Pathlike) -> None:
         """Give the hints on the first cloud; those on the others would be the same."""
@@ -146,6 +122,38 @@ class Detector:
         """The points that the voxelisation drops whatever its capacity."""
         most = MAX_INTENSITY * self.config.input.intensity_scale
         return int((~(np.isfinite(points).all(1) & (np.abs(points[:, 3]) <= most))).sum())
+
+
+class Detector(CloudDetector):
+    """A network with its weights: points in, detections out.
+
+    Clouds are padded to one of a few sizes, and the program is compiled once per size. Detectors whose configs differ
+    only in training share their programs. `variables` and `config` are those of the network. Raises ValueError for
+    variables that do not fit the config.
+    """
+
+    def __init__(self, variables: Variables, config: Config) -> None:
+        self.config = config
+        self.variables = jax.device_put(jax.device_get(fitting_variables(variables, config)))
+
+    @classmethod
+    def from_pretrained(
+        cls, path_or_name: str | os.PathLike[str], *, intensity_scale: float | None = None, z_shift: float | None = None
+    ) -> Detector:
+        """Load a weights file (.safetensors, or a released .pth), or bundled weights by name.
+
+        `intensity_scale` and `z_shift` replace those of `config.input`, for clouds of another sensor.
+        """
+        weights = load_weights(path_or_name)
+        given = {"intensity_scale": intensity_scale, "z_shift": z_shift}
+        changed = {name: float(value) for name, value in given.items() if value is not None}
+        return cls(weights.variables, replace(weights.config, input=replace(weights.config.input, **changed)))
+
+    def _run(self, clouds: Sequence[np.ndarray], frustum: np.ndarray) -> tuple[Detections, float]:
+        program = self.compile(max(map(len, clouds)), len(frustum))
+        start = time.perf_counter()
+        padded = pad_to_bucket(*clouds, batch_size=len(frustum))
+        return jax.device_get(program(self.variables, padded, frustum=frustum)), time.perf_counter() - start
 
     def compile(self, num_points: int, batch_size: int = 1) -> jax.stages.Compiled:
         """Return the program for `batch_size` clouds of up to `num_points` points, compiled on first use."""

@@ -46,7 +46,7 @@ from ciassd_jax.inference.artefact import (
     read_artefact,
     write_artefact,
 )
-from ciassd_jax.inference.detector import SMALLEST_BUCKET, Detector, pad_clouds
+from ciassd_jax.inference.detector import SMALLEST_BUCKET, CloudDetector, pad_clouds
 from ciassd_jax.inference.predict import predict
 from ciassd_jax.inference.programs import compile_program
 from ciassd_jax.model.checks import variables_of
@@ -94,7 +94,7 @@ def export_predict(
     return artefact
 
 
-class ExportedDetector(Detector):
+class ExportedDetector(CloudDetector):
     """An exported `predict`: a `Detector` of one size, which is called in the same way.
 
     A batch holds up to `batch_size` clouds of up to `num_points` points; empty clouds fill it. `manifest` describes the
@@ -106,7 +106,6 @@ class ExportedDetector(Detector):
         self.config = config_of(artefact.manifest)
         self.batch_size, self.num_points, _ = artefact.manifest["inputs"][0]["shape"]
         self._program = program
-        self._is_first = True
 
     def _run(self, clouds: Sequence[np.ndarray], frustum: np.ndarray) -> tuple[Detections, float]:
         if len(clouds) > self.batch_size:

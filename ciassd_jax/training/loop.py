@@ -89,7 +89,9 @@ def fit(
     A run that was interrupted or killed, and is resumed by the same call, ends with the same bits as an uninterrupted
     one; it can also resume on other devices. SIGTERM and Ctrl-C stop it after the running step, with the state saved,
     and at once while it compiles. `variables` are the initial weights, by default random from the seed of the batches.
-    `optimizer` is any optax transformation, by default that of `config.schedule`. `batches` is closed at the end.
+    `optimizer` is any optax transformation that a gradient and the loss suffice for, by default that of
+    `config.schedule`; what is evaluated and written are the parameters, or their running mean. `batches` is closed at
+    the end.
 
     The scenes of a batch are shared by all devices. Each of several processes calls this with its own `shard` of the
     batches and the same folder; only process 0 writes and logs. `log` is called with every line, which train.log keeps
