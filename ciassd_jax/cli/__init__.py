@@ -36,6 +36,7 @@ from ciassd_jax.cli.submit import Submit
 from ciassd_jax.cli.train import Train
 from ciassd_jax.cli.view import View
 from ciassd_jax.formats.errors import InputError
+from ciassd_jax.inference.machine import has_device
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,11 @@ def _run(arguments: Sequence[str]) -> int:
             raise
         discard(sys.stdout)
         print("error: A disk that is written to is full; free some space and run again.", file=sys.stderr)
+        return 2
+    except (RuntimeError, AssertionError):
+        if has_device():
+            raise
+        print("error: JAX finds no device; set JAX_PLATFORMS=cpu, or see `ciassd doctor`.", file=sys.stderr)
         return 2
 
 

@@ -25,7 +25,7 @@ from ciassd_jax.cli.options import (
     read_columns,
 )
 from ciassd_jax.data.clouds import find_clouds, read_cloud
-from ciassd_jax.formats.writing import check_folder, write_text
+from ciassd_jax.formats.writing import check_file, write_text
 from ciassd_jax.inference.timing import time_detection
 
 # Clouds that take turns, evenly spaced over a folder; more if a batch has more.
@@ -57,7 +57,7 @@ class Bench:
         if self.repeats < 1:
             raise UsageError(f"--repeats is {self.repeats}; time at least 1 call.")
         if self.json is not None:
-            check_folder(self.json.parent)
+            check_file(self.json)
         with warnings_as_lines(self.data):
             weights = self.config_options.load(self.weights)
             numbers = time_detection(

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from ciassd_jax.cli.messages import UsageError
-from ciassd_jax.formats.writing import check_folder
+from ciassd_jax.formats.writing import check_file
 from ciassd_jax.inference.weights import load_released_weights, load_weights, save_weights
 
 
@@ -32,7 +32,7 @@ class Convert:
             raise UsageError(f"{self.out} must end in .safetensors; choose such a name.")
         if self.out.resolve() == self.source.resolve():
             raise UsageError(f"{self.out} is the input itself; choose another name for the output.")
-        check_folder(self.out.parent)
+        check_file(self.out)
         weights = (load_weights if self.half else load_released_weights)(self.source)
         for row in weights.report:
             print(f"{row.status:<10}  {row.source:<58}  {row.target:<50}  {row.shape}")

@@ -21,7 +21,7 @@ from ciassd_jax.data.gt_sampling import (
     open_database,
 )
 from ciassd_jax.data.kitti import write_reduced
-from ciassd_jax.formats.writing import check_folder
+from ciassd_jax.formats.writing import check_file
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Prepare:
     def run(self) -> int:
         root, columns = find_root(self.root), read_columns(self.columns)
         path = database_path(self.out or root, self.split)
-        check_folder(path.parent)
+        check_file(path)
         with warnings_as_lines(root):
             if self.reduce:
                 if is_custom(root):

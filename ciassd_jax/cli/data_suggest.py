@@ -15,7 +15,7 @@ from ciassd_jax.cli.options import Columns, File, ImageSize, Split, Unset, read_
 from ciassd_jax.data.folders import find_root, open_dataset
 from ciassd_jax.data.splits import ALL
 from ciassd_jax.evaluation.suggest import suggest_config
-from ciassd_jax.formats.writing import check_folder, write_text
+from ciassd_jax.formats.writing import check_file, write_text
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Suggest:
     def run(self) -> int:
         root, base, columns = find_root(self.root), self.config_options.resolve(), read_columns(self.columns)
         if self.out is not None:
-            check_folder(self.out.parent)
+            check_file(self.out)
         with warnings_as_lines(root):
             dataset = open_dataset(root, self.split, self.image_size, columns, need_labels=False)
             config, notes = suggest_config(dataset, base, classes=self.classes, track=frames_with_bar)

@@ -29,7 +29,7 @@ from ciassd_jax.cli.options import (
 from ciassd_jax.config import Config
 from ciassd_jax.data.frames import Dataset
 from ciassd_jax.evaluation import LIMITS, Evaluation, Limits, evaluate, format_json, format_report, read_folders
-from ciassd_jax.formats.writing import check_folder, write_text
+from ciassd_jax.formats.writing import check_file, check_folder, write_text
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.inference.scoring import Scored, detect_dataset, find_trained, score_frames, write_frames
 from ciassd_jax.training.validation import format_scores, score_checkpoints
@@ -55,7 +55,7 @@ class Text:
     def run(self) -> int:
         limits = _add_overlaps(LIMITS, chain.from_iterable(self.overlap))
         if self.json is not None:
-            check_folder(self.json.parent)
+            check_file(self.json)
         with warnings_as_lines(self.results):
             truths, detections = read_folders(self.labels, self.results)
         evaluation = evaluate(truths, detections, limits)
@@ -153,7 +153,8 @@ class Evaluate:
         print(format_report(evaluation))
         boxes, seconds = sum(len(frame.lines) for frame in frames), sum(frame.result.seconds for frame in frames)
         milliseconds = f"{1e3 * seconds / len(frames):.0f} ms per frame without reading and compilation"
-        batches = f", in batches of {self.batch_size}" if self.batch_size > 1 else ""
+        size = min(self.batch_size, len(frames))
+        batches = f", in batches of {size}" if size > 1 else ""
         print(f"\n{len(frames)} frames, {boxes} boxes, {milliseconds}{batches}.")
         self._write(frames, evaluation)
         return 0

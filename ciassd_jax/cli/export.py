@@ -11,7 +11,7 @@ import tyro
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError
 from ciassd_jax.cli.options import WeightsFile
-from ciassd_jax.formats.writing import check_folder
+from ciassd_jax.formats.writing import check_file
 from ciassd_jax.inference.detector import SMALLEST_BUCKET
 from ciassd_jax.inference.export import export_predict
 
@@ -20,7 +20,7 @@ from ciassd_jax.inference.export import export_predict
 class Export:
     """Write the detector with its weights as one file: manifest, StableHLO program and a golden case.
 
-    `ciassd_jax.load_exported(OUT)` runs it, and so does JAX without this package.
+    Run it with `ciassd_jax.load_exported(OUT)`, or with JAX alone.
     """
 
     out: Annotated[Path, tyro.conf.Positional]
@@ -41,7 +41,7 @@ class Export:
                 raise UsageError(f"{name} is {value}; give at least 1.")
         if not self.platforms:
             raise UsageError("--platforms names no platform; choose from cpu, cuda and tpu.")
-        check_folder(self.out.parent)
+        check_file(self.out)
         weights = self.config_options.load(self.weights)
         golden = export_predict(
             weights.variables,

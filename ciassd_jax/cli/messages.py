@@ -28,6 +28,10 @@ _OPTIONS = {
     "use the config of the file": "leave out --preset and --config to use the config of the file",
     "`partial`": "`ciassd train --init-from FILE --partial`",
     "`overwrite`": "--overwrite",
+    "intervals.log": "--log-every",
+    "intervals.save": "--save-every",
+    "intervals.evaluate": "--evaluate-every",
+    "intervals.keep": "--keep",
     "`write_synthetic`": "`ciassd data synth`",
 }
 

@@ -10,7 +10,7 @@ import tyro
 
 from ciassd_jax.cli.messages import UsageError
 from ciassd_jax.cli.options import Unset
-from ciassd_jax.formats.writing import check_folder, replacing
+from ciassd_jax.formats.writing import check_file, replacing
 from ciassd_jax.training.metrics import read_metrics
 from ciassd_jax.view.curves import plot_curves
 
@@ -30,8 +30,8 @@ class Plot:
         out = self.out or self.runs[0] / "curves.png"
         if out.suffix.lower() != ".png":
             raise UsageError(f"--out {out} must end in .png; choose such a name.")
-        check_folder(out.parent)
         runs = {str(run): read_metrics(run) for run in self.runs}
+        check_file(out)
         try:
             figure = plot_curves(runs)
         except ModuleNotFoundError as error:

@@ -48,8 +48,8 @@ class Predict:
     """Detect objects in a cloud, in a folder of clouds or in the frames of a data set.
 
     Writes OUT/NAME.json for every cloud. A cloud with a calibration is cropped to the camera's view, and KITTI's rows
-    are written as OUT/NAME.txt. Of several clouds those that cannot be read are named at the end; the exit code is then
-    2, though the others are done.
+    are written as OUT/NAME.txt. Of several clouds, those that cannot be read are named at the end, with exit code 2;
+    the others are done.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
@@ -160,7 +160,8 @@ class Predict:
 
     def _summarise(self, results: Sequence[FrameResult], outside: int, shown: int) -> None:
         seconds = sum(result.seconds for result in results) / max(len(results), 1)
-        batches = f", in batches of {self.batch_size}" if self.batch_size > 1 else ""
+        size = min(self.batch_size, len(results))
+        batches = f", in batches of {size}" if size > 1 else ""
         print(
             f"{_cropped(outside)}{len(results)} frames, {sum(map(len, results))} boxes, {seconds:.3f} s per frame "
             f"without reading and compilation{batches}; results are in {self.out}."

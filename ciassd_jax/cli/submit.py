@@ -15,7 +15,7 @@ from ciassd_jax.data.splits import official_split, present_paths
 from ciassd_jax.formats.errors import InputError, Pathlike, read_bytes
 from ciassd_jax.formats.kitti_rows import parse_row
 from ciassd_jax.formats.lines import read_lines
-from ciassd_jax.formats.writing import check_folder, replacing
+from ciassd_jax.formats.writing import check_file, replacing
 
 # A fixed date, so that the same results give the same archive.
 _TIME = (1980, 1, 1, 0, 0, 0)
@@ -35,7 +35,7 @@ class Submit:
             raise UsageError(f"{self.out} must end in .zip; choose such a name.")
         if not self.results.is_dir():
             raise UsageError(f"{self.results} is not a folder; give the folder that holds the results.")
-        check_folder(self.out.parent)
+        check_file(self.out)
         problems = check_results(self.results)
         for problem in problems:
             print(problem)

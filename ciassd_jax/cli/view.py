@@ -30,7 +30,7 @@ from ciassd_jax.cli.options import (
 from ciassd_jax.formats.errors import FormatWarning, InputError, warn_of_file
 from ciassd_jax.formats.kitti_camera import frustum_of
 from ciassd_jax.formats.points import check_intensity
-from ciassd_jax.formats.writing import check_folder
+from ciassd_jax.formats.writing import check_file
 from ciassd_jax.inference.detector import Detector
 from ciassd_jax.view.html import view_html
 from ciassd_jax.view.sources import Source, add_saved, dataset_sources, detector_points, find_sources, read_source
@@ -68,7 +68,7 @@ class View:
 
     def run(self) -> int:
         self._check()
-        check_folder(self.out.parent)
+        check_file(self.out)
         with warnings_as_lines(self.path):
             frames = self._read()
             page = view_html(frames, title=f"{Path(self.path).name or self.path} - ciassd view")

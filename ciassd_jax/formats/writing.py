@@ -20,6 +20,13 @@ def check_folder(folder: Pathlike) -> None:
         raise InputError(f"{folder} cannot be written, as {existing} is read-only; choose another place.")
 
 
+def check_file(path: Pathlike) -> None:
+    """Raise InputError unless a file can be written at `path`, whose folder may not exist yet; creates nothing."""
+    if Path(path).is_dir():
+        raise InputError(f"{path} is a folder; name a file in it.")
+    check_folder(Path(path).parent)
+
+
 @contextmanager
 def replacing(path: Pathlike) -> Iterator[Path]:
     """Yield a temporary path that replaces `path` when the block succeeds, and is removed otherwise.

@@ -39,6 +39,8 @@ def detect_clouds(
     `columns` are those of `read_points`. Raises InputError for a cloud that cannot be used. With a list of `problems`,
     the errors are appended to it instead, and the other clouds are detected.
     """
+    # A program for more clouds than there are would only compile longer.
+    batch_size = min(batch_size, len(clouds))
     readable = _readable(detector.config.input.intensity_scale, clouds, columns, batch_size, problems)
     while batch := list(islice(readable, batch_size)):
         results = detector(

@@ -26,6 +26,15 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
+def has_device() -> bool:
+    """Return whether JAX can start a device."""
+    try:
+        return bool(jax.devices())
+    except (RuntimeError, AssertionError):
+        # JAX's assertion fails if JAX_PLATFORMS names a platform that it knows and the machine lacks.
+        return False
+
+
 def processor() -> str:
     """Return the name of the processor."""
     try:

@@ -92,7 +92,8 @@ def detect_dataset(
     with everything that was dropped, summed over the frames. Raises InputError for a frame that cannot be read or has
     no labels.
     """
-    scored: list[Scored] = []
+    # A program for more frames than there are would only compile longer.
+    scored, batch_size = list[Scored](), min(batch_size, len(dataset))
     frames = labelled_frames(dataset, track, ahead=batch_size)
     while batch := list(islice(frames, batch_size)):
         with warnings.catch_warnings():

@@ -22,7 +22,7 @@ import numpy as np
 from ciassd_jax.config.presets import tiny
 from ciassd_jax.data.frames import Dataset, Frame
 from ciassd_jax.data.loader import Rows, Stream, host_batches
-from ciassd_jax.inference.machine import describe_machine, free_memory, total_memory
+from ciassd_jax.inference.machine import describe_machine, free_memory, has_device, total_memory
 from ciassd_jax.inference.programs import compile_program, for_this_backend
 from ciassd_jax.model.network import RawPredictions, predict_raw, variable_shapes
 from ciassd_jax.types import Boxes, PointCloud, Variables
@@ -214,9 +214,7 @@ def forward() -> tuple[int, dict[str, float]]:
 
 def _forward() -> Iterator[Finding]:
     """Does a forward pass give the stored result?"""
-    try:
-        jax.devices()
-    except (RuntimeError, AssertionError):
+    if not has_device():
         yield Finding("note", "Not run, because there is no device; see devices.")
         return
     start = time.perf_counter()
@@ -250,7 +248,7 @@ def _gb(size: float) -> str:
 
 
 CHECKS = {
-    "versions": Check(_versions, "A package is missing", "pip install -U --force-reinstall ciassd_jax"),
+    "versions": Check(_versions, "A package is missing", "install ciassd_jax again, as its README says"),
     "devices": Check(
         _devices,
         "JAX finds no device",
@@ -267,5 +265,5 @@ CHECKS = {
         "A tiny network does not give the stored result",
         "install other versions of jax and jaxlib, or set JAX_PLATFORMS=cpu",
     ),
-    "extras": Check(_extras, "The extras cannot be read", "pip install -U --force-reinstall ciassd_jax"),
+    "extras": Check(_extras, "The extras cannot be read", "install ciassd_jax again, as its README says"),
 }

@@ -9,7 +9,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,8 +68,10 @@ class Intervals:
     keep: int = 3
 
     def __post_init__(self) -> None:
-        if min(self.log, self.save, self.keep) < 1 or self.evaluate < 0:
-            raise ValueError(f"{self}: log, save and keep must be at least 1, evaluate at least 0.")
+        for one in fields(self):
+            value, least = getattr(self, one.name), int(one.name != "evaluate")
+            if value < least:
+                raise ValueError(f"intervals.{one.name} is {value}; give at least {least}.")
 
 
 def fit(

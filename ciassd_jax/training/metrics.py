@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,7 @@ def read_metrics(workdir: Pathlike) -> list[dict[str, Any]]:
         raise InputError(f"{workdir} has no {METRICS}; give the folder of a training.")
     lines = list(parse_lines(path))
     if not lines:
-        raise InputError(f"{path} has no line yet; wait until the training has logged its first steps.")
+        raise InputError(f"{path} has no complete line yet; wait until the training has logged its first steps.")
     return lines
 
 
@@ -100,8 +100,12 @@ def parse_lines(path: Path) -> Iterator[dict[str, Any]]:
             line = json.loads(text)
         except json.JSONDecodeError:
             continue
-        if isinstance(line, dict) and isinstance(line.get("step"), int):
+        if isinstance(line, dict) and isinstance(line.get("step"), int) and _is_numeric(line.values()):
             yield line
+
+
+def _is_numeric(values: Iterable[Any]) -> bool:
+    return all(isinstance(value, int | float | None) for value in values)
 
 
 def format_line(line: Mapping[str, Any]) -> str:

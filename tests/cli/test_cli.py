@@ -163,3 +163,21 @@ def test_output_to_a_full_disk_is_one_sentence(
         monkeypatch.setattr(sys, "stdout", full)
         assert main(["--version"]) == 2
     assert capsys.readouterr().err == ("error: A disk that is written to is full; free some space and run again.\n")
+
+
+def test_without_a_device_commands_say_so(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*arguments: object, **options: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("ciassd_jax.cli.info.Info.run", fail)
+    with pytest.raises(AssertionError):
+        run("info")
+    monkeypatch.setattr("jax.devices", fail)
+    assert answer(run, "info") == "JAX finds no device; set JAX_PLATFORMS=cpu, or see `ciassd doctor`."
+
+
+def test_a_folder_in_place_of_a_file_is_refused_before_the_work(run: Any, weights: Path, tmp_path: Path) -> None:
+    for out in ("", tmp_path):
+        sentence = f"{Path(out)} is a folder; name a file in it."
+        assert answer(run, "bench", "--weights", weights, "--json", out) == sentence
+        assert answer(run, "export", "--weights", weights, out) == sentence

@@ -40,7 +40,7 @@ def test_several_runs_are_one_picture(run: Callable[..., Run], trained: Path, tm
     [
         ((), "Nothing to draw"),
         (("{}",), "has no metrics.jsonl; give the folder of a training"),
-        (("{}/empty",), "has no line yet"),
+        (("{}/empty",), "has no complete line yet"),
         (("{}/run", "--out", "curves.pdf"), "must end in .png"),
     ],
 )

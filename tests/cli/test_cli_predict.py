@@ -18,6 +18,7 @@ from released import released_state
 from small import CALIBRATION, IMAGE_SIZE, small_cloud, small_config
 
 from ciassd_jax import Detector
+from ciassd_jax.formats.errors import InputError
 from ciassd_jax.formats.kitti_rows import read_rows
 from ciassd_jax.formats.points import write_bin
 from ciassd_jax.inference.results import FrameResult
@@ -102,6 +103,16 @@ def test_batches_give_the_same_boxes_in_order(run: Any, weights: Path, tmp_path:
     for name, boxes in alone.items():
         assert len(boxes) > 0
         np.testing.assert_allclose(batched[name], boxes, atol=1e-5)
+
+
+def test_no_batch_is_larger_than_the_folder(run: Any, weights: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    def detect(self: Detector, points: list[Any], *, batch_size: int, **named: Any) -> None:
+        raise InputError(f"{len(points)} clouds, compiled for {batch_size}")
+
+    monkeypatch.setattr(Detector, "__call__", detect)
+    folder = folder_of(tmp_path / "clouds", {"0.bin": GOOD, "1.bin": GOOD})
+    result = run("predict", folder, "--weights", weights, "--out", tmp_path / "out", "--batch-size", 1000)
+    assert result.err == "error: 2 clouds, compiled for 2\n"
 
 
 def test_a_cloud_that_cannot_be_read_does_not_prevent_the_others(run: Any, weights: Path, tmp_path: Path) -> None:

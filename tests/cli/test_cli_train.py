@@ -331,7 +331,7 @@ def test_fields_of_the_schedule_are_replaced(
         ({"steps": 3, "epochs": 2}, "either --steps or --epochs"),
         ({"workers": -1}, "workers"),
         ({"seed": -1}, "seed"),
-        ({"log-every": 0}, "must be at least 1"),
+        ({"log-every": 0}, "--log-every is 0; give at least 1."),
         ({"learning-rate": 0}, "learning_rate must be positive"),
         ({"overfit-one": "000777"}, "Frame 000777 is not among the 3 of train"),
         ({"split": "none"}, "none"),

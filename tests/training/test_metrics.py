@@ -75,9 +75,14 @@ def test_a_line_that_a_kill_cut_is_left_out(tmp_path: Path) -> None:
     assert read_metrics(tmp_path) == [{"step": 2, "loss": None}]
 
 
+def test_a_line_of_other_things_than_numbers_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_text('{"step": 2, "loss": "low"}\n{"step": 4, "loss": 1.5}\n')
+    assert read_metrics(tmp_path) == [{"step": 4, "loss": 1.5}]
+
+
 def test_a_folder_without_metrics_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"has no metrics\.jsonl; give the folder of a training"):
         read_metrics(tmp_path)
     (tmp_path / "metrics.jsonl").write_text("")
-    with pytest.raises(InputError, match="has no line yet"):
+    with pytest.raises(InputError, match="has no complete line yet"):
         read_metrics(tmp_path)
