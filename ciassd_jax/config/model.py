@@ -215,6 +215,7 @@ class HeadConfig:
     angles: tuple[float, ...] = (0.0, math.pi / 2)
     # Without the IoU branch q is 1 for every box, so the confidence is the class probability.
     predict_iou: bool = True
+
     iou_kernel: Literal[1, 3] = 1
     iou_bias: bool = True
 
@@ -231,6 +232,7 @@ class DetectionConfig:
     score_threshold: float = 0.3
     # The rectified score from which a box is a detection. It changes none of the other boxes.
     min_score: float = 0.0
+
     max_candidates: int = 1000
     iou_exponent: float = 4.0
     clamp_iou: bool = True

@@ -18,6 +18,7 @@ class AugmentationConfig:
     # Keep objects that are not easy, moderate or hard out of the database, and with `filter_scenes` out of the scenes.
     difficulty_filter: bool = True
     filter_scenes: bool = False
+
     flip_probability: float = 0.5
     max_rotation: float = 0.785
     min_scale: float = 0.95
@@ -79,6 +80,7 @@ class ScheduleConfig:
     # 60 epochs of KITTI's 3712 frames in batches of 4.
     total_steps: int = 55680
     batch_size: int = 4
+
     kind: Literal["one_cycle", "cosine"] = "one_cycle"
     learning_rate: float = 3e-3
     # One cycle: the learning rate starts at 1 / div_factor of its peak, rises for this share of the steps, and ends at
@@ -87,6 +89,7 @@ class ScheduleConfig:
     div_factor: float = 10.0
     final_div_factor: float = 1e4
     b1_range: tuple[float, float] = (0.95, 0.85)
+
     b2: float = 0.99
     weight_decay: float = 0.01
     max_gradient_norm: float = 35.0
