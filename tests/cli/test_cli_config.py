@@ -161,3 +161,16 @@ def test_an_invalid_grid_names_the_option_and_a_value_that_works(
 )
 def test_messages_name_the_options(message: str, shown: str) -> None:
     assert describe(message).startswith(shown)
+
+
+def test_help_says_of_each_field_what_is_said_of_it_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "--help-config"])
+    text = capsys.readouterr().out
+    for words, fields in (
+        ("The rectified score", 1),
+        ("Without the IoU branch", 1),
+        ("60 epochs", 2),
+        ("Keep objects", 2),
+    ):
+        assert text.count(words) == fields
