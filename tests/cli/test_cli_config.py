@@ -163,9 +163,9 @@ def test_messages_name_the_options(message: str, shown: str) -> None:
     assert describe(message).startswith(shown)
 
 
-def test_help_says_of_each_field_what_is_said_of_it_alone(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_says_of_each_field_what_is_said_of_it_alone(run: Any, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        main(["train", "--help-config"])
+        run("train", "--help-config")
     text = capsys.readouterr().out
     for words, fields in (
         ("The rectified score", 1),
