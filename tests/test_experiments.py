@@ -169,7 +169,10 @@ def test_what_cannot_be_run_is_one_sentence(
         (["table5_beta"], "KITTI_ROOT"),
         (["table5_beta", "--data", "nowhere"], "nowhere"),
         (["table4_modules", "--data", str(root), "--weights", str(weights)], "--weights"),
-        (["table5_beta", "--data", str(root), "--weights", str(weights), "--preset", "car"], "use the config of the file"),
+        (
+            ["table5_beta", "--data", str(root), "--weights", str(weights), "--preset", "car"],
+            "use the config of the file",
+        ),
     ):
         assert run.main([*arguments, "--out", str(tmp_path / "out")]) == 2
         error = capsys.readouterr().err

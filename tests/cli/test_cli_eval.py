@@ -203,6 +203,7 @@ def test_all_checkpoints_are_one_table(work: Path, capsys: pytest.CaptureFixture
     assert "Car_bev_0.50_moderate_R40" in written["4"]
 
 
+@pytest.mark.slow
 def test_all_is_of_a_training_and_writes_no_detections(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = ["--data", str(work / "kitti"), "--all"]
     for others in (["--weights", "car_lite"], ["--workdir", str(work / "run"), "--out", str(work / "out")]):

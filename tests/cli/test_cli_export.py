@@ -11,6 +11,7 @@ from ciassd_jax import load_exported
 from ciassd_jax.inference import export
 
 
+@pytest.mark.slow
 def test_export_writes_a_file_that_loads(run: Any, weights: Path, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(export, "_street", lambda index, config, num_points: small_cloud(index))
     out = tmp_path / "out" / "car.ciassd"

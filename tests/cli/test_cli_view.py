@@ -153,6 +153,7 @@ def test_weights_detect_and_saved_results_show_the_same(view: Any, weights: Path
     assert [frame["found"] for frame in saved.frames] == [frame["found"] for frame in detected.frames]
 
 
+@pytest.mark.slow
 def test_the_least_score_holds_for_detecting_and_for_saved_results(view: Any, weights: Path, tmp_path: Path) -> None:
     (tmp_path / "clouds").mkdir()
     write_bin(tmp_path / "clouds" / "a.bin", small_cloud())

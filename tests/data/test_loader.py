@@ -241,6 +241,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("what", ["leave", "wait"])
+@pytest.mark.slow
 def test_workers_end_with_their_parent_however_it_ends(mini, tmp_path: Path, what: str) -> None:
     """Silently if the loader was not closed; after a SIGKILL too, as the end of the shared output shows."""
     (tmp_path / "script.py").write_text(SCRIPT)

@@ -111,6 +111,7 @@ def test_a_frozen_part_stands_still_under_the_weight_decay_of_any_optimizer(no_t
     assert (after.params["neck"]["kernel"] != state.params["neck"]["kernel"]).all()
 
 
+@pytest.mark.slow
 def test_an_own_optimizer_in_the_step(composed):
     config, _, _, _, gradient = composed
     optimizer = optax.sgd(0.1)
@@ -155,6 +156,7 @@ def test_frozen_batch_norm_uses_its_running_statistics():
     assert all(branch["bias"].any() for branch in gradient["head"].values())
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_other_parts_is_that_of_the_whole():
     """Only the head is left: its gradient by way of running statistics, compared with finite differences."""
     config = with_frozen("backbone", "neck")
@@ -173,6 +175,7 @@ def test_the_gradient_of_the_other_parts_is_that_of_the_whole():
     assert float(gradient["head"]["class"]["bias"].sum()) == pytest.approx(slope, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_an_own_term_changes_the_gradient_by_its_own(composed):
     config, state, _, _, plain = composed
 
@@ -256,6 +259,7 @@ def test_frozen_parts_are_of_training_alone():
     assert Config.from_json(config.to_json()) == config
 
 
+@pytest.mark.slow
 def test_features_are_what_the_head_reads():
     config, variables = small_config(), random_variables(small_config())
     features = jax.jit(predict_features)(variables, batch().cloud, config)

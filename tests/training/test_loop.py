@@ -153,7 +153,7 @@ def test_validates_on_synthetic_frames(tmp_path: Path) -> None:
     assert written == {"000000.txt", "000001.txt"}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_a_stopped_run_resumes_to_the_same_bits(
     number: int, whole: tuple[Fitted, Path, list[str]], root: Path, tmp_path: Path
 ) -> None:
