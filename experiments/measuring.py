@@ -96,7 +96,9 @@ def _score(one: Predicted, config: Config, settings: Mapping[str, DetectionConfi
     scored = {}
     for name, setting in settings.items():
         batch = _postprocess(one.raw, replace(config, detection=setting), frustum=planes[None])
-        scored[name] = score_frame(one.frame, one.truth, frame_result(batch, 0, config.class_names, 0.0, {"clipped": 0, "invalid": 0}))
+        scored[name] = score_frame(
+            one.frame, one.truth, frame_result(batch, 0, config.class_names, 0.0, {"clipped": 0, "invalid": 0})
+        )
     return scored
 
 
