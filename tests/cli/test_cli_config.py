@@ -92,6 +92,7 @@ def test_what_cannot_be_used_is_one_sentence(run: Any, arguments: tuple[str, ...
     assert result.err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_path_after_names_is_told_and_the_remedy_works(run: Any, shown: Any, tmp_path: Path) -> None:
     names = ("--config.classes.0.similar", "Van", "Truck")
     result = run("data", "check", *names, tmp_path)

@@ -184,6 +184,7 @@ def test_the_weights_of_a_training_and_the_environments_data(
     assert json.loads(out.read_text())["Car"]["3d"]["R40"]["0.70"] is not None
 
 
+@pytest.mark.slow
 def test_all_checkpoints_are_one_table(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = small_config()
     state = create_train_state(jax.random.key(0), config, variables=random_variables(config))

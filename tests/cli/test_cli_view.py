@@ -248,6 +248,7 @@ def test_without_the_extra_one_sentence_names_it(tmp_path: Path) -> None:
     assert re.fullmatch(r"error: [^\n]*plotly[^\n]*pip install 'ciassd_jax\[viz\]'[^\n]*\.\n", done.stderr)
 
 
+@pytest.mark.slow
 def test_a_cloud_of_millions_is_thinned_and_said_so(view: Any, tmp_path: Path) -> None:
     np.save(tmp_path / "huge.npy", np.broadcast_to(np.float32([5, 1, 0, 0.5]), (10_000_000, 4)))
     result = view(tmp_path / "huge.npy")

@@ -189,7 +189,7 @@ def test_processes_share_the_same_batches(mini) -> None:
     assert make(mini, shard=(1, 2)).state == make(mini).state
 
 
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_bad_file_is_named_and_can_be_repaired(tmp_path: Path, workers: int) -> None:
     mini = open_mini(tmp_path)
     bad = tmp_path / "training/velodyne/000001.bin"

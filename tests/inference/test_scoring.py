@@ -187,6 +187,7 @@ def test_frames_in_memory_score_like_those_of_files(tmp_path: Path) -> None:
     assert to_json(score_dataset(blurred_truth(in_memory), in_memory)) == score
 
 
+@pytest.mark.slow
 def test_synthetic_frames_can_be_scored() -> None:
     dataset = open_synthetic(seed=3, frames=2, lidar=Lidar(columns=128))
     truth = iter([dataset.read(index) for index in range(2)])

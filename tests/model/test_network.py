@@ -218,6 +218,7 @@ def test_backends_agree_in_training(variables):
     jax.tree_util.tree_map_with_path(assert_close_to_scale, gradients, dense_gradients)
 
 
+@pytest.mark.slow
 def test_training_on_an_empty_batch_is_finite(variables):
     outputs, updated, gradients = train_backbone(variables, small_voxels(0, 0), SMALL)
     chex.assert_tree_all_finite((outputs, gradients))

@@ -460,6 +460,7 @@ def test_a_higher_sensor_sees_the_same_street_from_above() -> None:
     np.testing.assert_allclose(moved, np.broadcast_to([0, 0, lower], moved.shape), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_own_class_stands_among_cars_and_people() -> None:
     frames = [open_synthetic(0, 12, OTHER, "Forklift").read(index) for index in range(12)]
     names = [name for frame in frames for name in frame.names]

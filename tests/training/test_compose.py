@@ -140,6 +140,7 @@ def test_frozen_parts_keep_every_bit_and_the_others_learn():
     assert losses[-1] < losses[0]
 
 
+@pytest.mark.slow
 def test_frozen_batch_norm_uses_its_running_statistics():
     """With the whole trunk frozen, the loss of training is that of the network in evaluation mode."""
     config = with_frozen("backbone", "neck")

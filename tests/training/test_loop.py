@@ -236,6 +236,7 @@ def test_an_invalid_label_is_named_and_the_state_is_saved(root: Path, tmp_path: 
     assert "  InputError: Frame 00000" in (tmp_path / "train.log").read_text().splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_a_dead_worker_loses_no_step(
     whole: tuple[Fitted, Path, list[str]], root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
