@@ -11,7 +11,7 @@ import tyro
 
 from ciassd_jax.cli.config_options import ConfigOptions
 from ciassd_jax.cli.messages import UsageError, warnings_as_lines
-from ciassd_jax.cli.options import Columns, Folder, MinScore, ScoreThreshold, WeightsFile, open_simulated, read_columns
+from ciassd_jax.cli.options import Columns, Folder, Thresholds, WeightsFile, open_simulated, read_columns
 from ciassd_jax.formats.points import read_points
 from ciassd_jax.formats.writing import check_folder, replacing
 from ciassd_jax.inference.detector import Detector
@@ -36,15 +36,14 @@ class Demo:
     seed: int = 0
     """Seed of the streets."""
     columns: Columns = None
-    score_threshold: ScoreThreshold = None
-    min_score: MinScore = None
+    thresholds: Annotated[Thresholds, tyro.conf.OmitArgPrefixes] = field(default_factory=Thresholds)
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 
     def run(self) -> int:
         if self.scenes < 1:
             raise UsageError(f"--scenes {self.scenes} shows nothing; ask for at least 1.")
         with warnings_as_lines(self.file or "simulated street"):
-            short = {"detection.score_threshold": self.score_threshold, "detection.min_score": self.min_score}
+            short = self.thresholds.fields()
             weights = self.config_options.load(self.weights, short)
             check_folder(self.out)
             frames = self._frames()

@@ -19,9 +19,8 @@ from ciassd_jax.cli.options import (
     File,
     Folder,
     Frames,
-    MinScore,
-    ScoreThreshold,
     Split,
+    Thresholds,
     Unset,
     WeightsFile,
     check_batch_size,
@@ -117,8 +116,7 @@ class Evaluate:
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     dtype: Unset[Dtype] = None
     """Compute type of the network; by default that of the weights."""
-    score_threshold: ScoreThreshold = None
-    min_score: MinScore = None
+    thresholds: Annotated[Thresholds, tyro.conf.OmitArgPrefixes] = field(default_factory=Thresholds)
     files: Annotated[
         Annotated[Text, tyro.conf.subcommand("txt")] | None,
         tyro.conf.arg(name="", help="Instead of a network:"),
@@ -133,11 +131,7 @@ class Evaluate:
 
     def _network(self) -> int:
         check_batch_size(self.batch_size)
-        short = {
-            "dtype": self.dtype,
-            "detection.score_threshold": self.score_threshold,
-            "detection.min_score": self.min_score,
-        }
+        short = {"dtype": self.dtype, **self.thresholds.fields()}
         weights = self.config_options.load(self._weights(), short)
         folder = self.data_set.find_folder()
         for out in (self.out, self.json and self.json.parent):

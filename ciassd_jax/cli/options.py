@@ -33,22 +33,6 @@ ImageSize = Annotated[
     ),
 ]
 Dtype = Literal["float32", "bfloat16"]
-ScoreThreshold = Annotated[
-    float | None,
-    tyro.conf.arg(
-        metavar="PROBABILITY",
-        help="Lowest class probability of a candidate, before its score is rectified and NMS.",
-        help_behavior_hint="",
-    ),
-]
-MinScore = Annotated[
-    float | None,
-    tyro.conf.arg(
-        metavar="SCORE",
-        help="Lowest score of a detection: the class probability times the predicted IoU ** 4, after NMS.",
-        help_behavior_hint="",
-    ),
-]
 BatchSize = Annotated[int, tyro.conf.arg(metavar="CLOUDS", help="Number of clouds that are detected at once.")]
 Columns = Annotated[
     str | None,
@@ -62,6 +46,20 @@ Columns = Annotated[
 # In place of a folder: frames of the LiDAR simulator.
 SIMULATED = "simulated"
 SIMULATED_FRAMES = 100
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """What a candidate and a detection must reach."""
+
+    score_threshold: Annotated[float | None, tyro.conf.arg(metavar="PROBABILITY", help_behavior_hint="")] = None
+    """Lowest class probability of a candidate, before its score is rectified and NMS."""
+    min_score: Annotated[float | None, tyro.conf.arg(metavar="SCORE", help_behavior_hint="")] = None
+    """Lowest score of a detection: the class probability times the predicted IoU ** 4, after NMS."""
+
+    def fields(self) -> dict[str, float | None]:
+        """Return the fields of the config that the options set."""
+        return {"detection.score_threshold": self.score_threshold, "detection.min_score": self.min_score}
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,8 @@ from ciassd_jax.cli.options import (
     Dtype,
     Folder,
     ImageSize,
-    MinScore,
-    ScoreThreshold,
     Split,
+    Thresholds,
     Unset,
     WeightsFile,
     check_batch_size,
@@ -75,8 +74,7 @@ class Predict:
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
     dtype: Unset[Dtype] = None
     """Compute type of the network."""
-    score_threshold: ScoreThreshold = None
-    min_score: MinScore = None
+    thresholds: Annotated[Thresholds, tyro.conf.OmitArgPrefixes] = field(default_factory=Thresholds)
 
     def run(self) -> int:
         self._check()
@@ -112,11 +110,7 @@ class Predict:
             raise UsageError(str(error)) from error
 
     def _detector(self) -> Detector:
-        short = {
-            "dtype": self.dtype,
-            "detection.score_threshold": self.score_threshold,
-            "detection.min_score": self.min_score,
-        }
+        short = {"dtype": self.dtype, **self.thresholds.fields()}
         weights = self.config_options.load(self.weights, short)
         check_folder(self.out)
         return Detector(weights.variables, weights.config)

@@ -19,9 +19,8 @@ from ciassd_jax.cli.options import (
     File,
     Folder,
     ImageSize,
-    MinScore,
-    ScoreThreshold,
     Split,
+    Thresholds,
     Unset,
     WeightsFile,
     open_simulated,
@@ -62,8 +61,7 @@ class View:
     """Also show the camera's image, with the boxes projected into it."""
     image_size: ImageSize = None
     columns: Columns = None
-    score_threshold: ScoreThreshold = None
-    min_score: MinScore = None
+    thresholds: Annotated[Thresholds, tyro.conf.OmitArgPrefixes] = field(default_factory=Thresholds)
     config_options: Annotated[ConfigOptions, tyro.conf.OmitArgPrefixes] = field(default_factory=ConfigOptions)
 
     def run(self) -> int:
@@ -85,9 +83,9 @@ class View:
             raise UsageError(str(error)) from error
         if self.weights and self.results:
             raise UsageError("--weights detects objects and --results shows saved detections; give one of them.")
-        if self.score_threshold is not None and not self.weights:
+        if self.thresholds.score_threshold is not None and not self.weights:
             raise UsageError("--score-threshold is for detecting; give --weights too, or use --min-score.")
-        if self.min_score is not None and not (self.weights or self.results):
+        if self.thresholds.min_score is not None and not (self.weights or self.results):
             raise UsageError("--min-score is for detections; give --weights or --results too.")
         if self.frames < 1:
             raise UsageError(f"--frames {self.frames} shows nothing; ask for at least 1.")
@@ -101,7 +99,7 @@ class View:
         sources = self._choose(self._sources())
         if self.image and not any(source.image for source in sources.values()):
             raise UsageError(f"{self.path} has no images; leave out --image.")
-        short = {"detection.score_threshold": self.score_threshold, "detection.min_score": self.min_score}
+        short = self.thresholds.fields()
         weights = self.config_options.load(self.weights, short) if self.weights else None
         config = weights.config if weights else self.config_options.resolve(short=short)
         frames = [read_source(sources[name], image=self.image) for name in frames_with_bar(list(sources))]

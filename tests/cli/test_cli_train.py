@@ -393,4 +393,5 @@ def test_a_label_that_is_none_names_its_frame(
     refused = run(workdir=tmp_path / "w", data=data, split="one", **{"init-from": tmp_path / "start.safetensors"})
     assert refused.code == 2
     assert words in refused.err
-    assert refused.err.count("error: ") == 1
+    assert refused.complaints.startswith("error: ")
+    assert refused.complaints.count("\n") == 1
